@@ -191,7 +191,7 @@ def test_one_that_spoils_a_batch_does_not_take_the_others_chunks(fault: type[Exc
                 else:
                     assert isinstance(reply, dict) and reply["real_time"]["joined"]
             assert isinstance(server._calls, PolicyCalls)
-            assert server._calls.joining.measured_largest == (2 if fault is RuntimeError else 8)
+            assert server._calls.joining.formed_largest(0.0) == (2 if fault is RuntimeError else 8)
             assert server._calls.times.measured_largest == 8
 
     served(test, policy_class=Together, **GUIDED)  # type: ignore[arg-type]

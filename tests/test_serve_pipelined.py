@@ -17,6 +17,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.serve import PolicyServer
+from turbopi.serve import worker as worker_module
 from turbopi.wire import pack, unpack
 
 Test = Callable[[PolicyServer, PipelinedFakePolicy], Awaitable[None]]
@@ -113,6 +114,24 @@ def test_stopping_answers_what_is_in_flight() -> None:
             assert unpack(bytes(await staying.recv()))["prompt"] == "behind it"  # type: ignore[arg-type]
             await asyncio.wait_for(stop, 120)
         assert policy.in_flight == 0
+
+    asyncio.run(main())
+
+
+def test_an_answer_that_never_comes_holds_no_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_module, "DRAIN_SECONDS", 0.05)
+
+    async def main() -> None:
+        policy = PipelinedFakePolicy()
+        server = PolicyServer(policy, port=0)
+        await server.start()
+        async with client(server) as connection:
+            await connection.send(pack(observation("hold")))
+            await eventually(policy.started.is_set)
+            stop = asyncio.create_task(server.stop())
+            assert await connection.recv() == "the server is shutting down"
+            await asyncio.wait_for(stop, 30)
+        policy.release.set()
 
     asyncio.run(main())
 

@@ -308,11 +308,56 @@ def test_sessions_are_bounded_and_dropped_by_a_rule(monkeypatch: pytest.MonkeyPa
     two = server.plan({"place": 0, "turbopi/session": "y", "turbopi/step": 1}, "c")
     with pytest.raises(ObservationError, match="session 'x' has a request that isn't answered yet"):
         ask("x")
-    with pytest.raises(ObservationError, match="all 2 sessions have requests"):
-        ask("z")
+    assert ask("z") is False and ask("a") is True, "requests that aren't answered take no session's place"
     server.release(one)
     server.release(two)
-    assert ask("z") is False
+    assert ask("z") is True
+
+
+def test_requests_without_actions_end_no_session_and_leave_none() -> None:
+    server, policy, _, metrics = real_time(execution="rtc", control_hz=50)
+    for step in range(2):
+        call(server, policy, {"place": 0, "turbopi/session": "arm", "turbopi/step": step}, "robot")
+        for number in range(2 * sessions_module.MAX_SESSIONS):
+            more = {} if number % 2 else {"turbopi/reset": True}
+            asked = {"place": 0, "turbopi/session": f"x{number}", "turbopi/step": 1, **more}
+            server.release(server.plan(asked, "other"))  # refused: busy, late, …
+            with pytest.raises(ObservationError):  # refused at once
+                server.plan({**asked, "turbopi/execution_horizon": H + 1, "turbopi/mode": "fast"}, "other")
+        assert len(server._named) == 1
+    assert policy.calls[-1] is not None and "turbopi_real_time_sessions 1.0" in metrics.text()
+
+
+def test_a_connection_with_many_sessions_loses_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions_module, "MAX_SESSIONS", 4)
+    server, policy, _, _ = real_time(execution="rtc", control_hz=50)
+
+    def joined(name: str, connection: str) -> bool:
+        call(server, policy, {"place": 0, "turbopi/session": name, "turbopi/step": 1}, connection)
+        return policy.calls[-1] is not None
+
+    assert not joined("arm", "robot") and not joined("leg", "another")
+    for number in range(10):
+        assert not joined(f"x{number}", "greedy")
+    assert joined("arm", "robot") and joined("x9", "greedy") and not joined("x0", "greedy")
+    server.closed("greedy")  # then its sessions are one group, still the largest
+    assert not joined("new", "a new one") and joined("arm", "robot") and joined("leg", "another")
+
+
+def test_a_refused_newer_request_leaves_the_waiting_one_the_sessions() -> None:
+    waiting = True
+    server, policy, _, _ = real_time(execution="rtc", control_hz=50)
+    server._waits = lambda name: waiting
+    asked = {"place": 0, "turbopi/session": "arm", "turbopi/step": 1}
+    first = server.plan(asked, "robot")
+    server.release(server.plan(asked, "other"))  # late itself: the first one still waits
+    waiting = False  # it runs
+    with pytest.raises(ObservationError, match="isn't answered yet"):
+        server.plan(asked, "other")
+    server.finish(first, policy.infer(first.observation, **first.arguments))
+    server.release(first)
+    call(server, policy, {**asked, "turbopi/step": 2})
+    assert policy.calls[-1] is not None
 
 
 def test_a_request_without_actions_leaves_the_sessions_chunk_as_it_is() -> None:

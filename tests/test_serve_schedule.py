@@ -3,13 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 from itertools import count
+from random import Random
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, BatchTimes
+from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, LONGEST_PAUSE, PAUSE, BatchTimes
 from turbopi.serve.returns import MOST, Returns
 from turbopi.serve.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
 
@@ -57,6 +60,7 @@ class Turn:
     started: float
     ended: float
     waited: tuple[Request, ...]  # those that waited when it began, and weren't in it
+    crowded: bool  # more had come than could be served
 
     @property
     def rows(self) -> int:
@@ -107,7 +111,7 @@ def simulate(schedule: Schedule, arrivals: Sequence[Request]) -> History:
         if decision.turn:
             rows = sum(one.rows for one in decision.turn)
             ends = now + schedule.times.total(rows, now)
-            history.turns.append(Turn(decision.turn, now, ends, tuple(schedule._waiting)))
+            history.turns.append(Turn(decision.turn, now, ends, tuple(schedule._waiting), now < schedule.crowded_until))
         wake = math.inf if decision.wake is None else decision.wake
     raise AssertionError("it never ends")
 
@@ -186,6 +190,8 @@ def test_a_turn_is_of_the_earliest_deadline_and_of_robots_first(
     made: list[Request], seconds: dict[int, float], limit: int
 ) -> None:
     for turn in simulate(Schedule(limit, table(seconds)), made).turns:
+        if turn.crowded:
+            continue
         head = turn.requests[0]
         if head.overtaken >= OVERTAKEN:
             continue
@@ -197,10 +203,10 @@ def test_a_turn_is_of_the_earliest_deadline_and_of_robots_first(
 
 
 @settings(max_examples=100, deadline=None)
-@given(arrivals(plain=True), limits)
-def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[Request], limit: int) -> None:
+@given(arrivals(plain=True))
+def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[Request]) -> None:
     """Nobody begins later than in a line of one call at a time."""
-    history = simulate(Schedule(limit, table({1: T1})), made)
+    history = simulate(Schedule(40, table({1: T1})), made)
     served = [turn.requests[0] for turn in history.turns]
     assert served == sorted(served, key=lambda one: one.number)
     free = 0.0
@@ -212,9 +218,9 @@ def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[
 
 
 @settings(max_examples=100, deadline=None)
-@given(arrivals(plain=True), limits)
-def test_batches_of_equal_deadlines_never_change_the_order(made: list[Request], limit: int) -> None:
-    served = [one for turn in simulate(Schedule(limit, table(PAYING)), made).turns for one in turn.requests]
+@given(arrivals(plain=True))
+def test_batches_of_equal_deadlines_never_change_the_order(made: list[Request]) -> None:
+    served = [one for turn in simulate(Schedule(40, table(PAYING)), made).turns for one in turn.requests]
     assert served == sorted(served, key=lambda one: one.number)
 
 
@@ -384,13 +390,165 @@ def test_a_robot_takes_the_place_of_the_last_simulator_when_all_are_taken() -> N
     first, last = (request(priority=SIMULATOR, within=within) for within in (1.0, 2.0))
     schedule.add(first, 0.0)
     schedule.add(last, 0.0)
-    (refused,) = schedule.add(request(priority=SIMULATOR), 0.0)
-    assert refused.request.deadline == 1.0 and refused.text.startswith("busy: 2 requests wait already")
+    (refused,) = schedule.add(request(priority=SIMULATOR, within=3.0), 0.0)
+    assert refused.request.deadline == 3.0 and refused.text.startswith("busy: 2 requests wait already")
     (refused,) = schedule.add(request(), 0.0)
     assert refused.request is last and refused.kind == "busy" and schedule.waiting == 2
     schedule.add(request(), 0.0)
     full = request()
     assert [one.request for one in schedule.add(full, 0.0)] == [full]  # only robots are left
+
+
+def test_a_request_that_is_late_itself_replaces_nothing() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    waits = request(session="arm", source=1)
+    schedule.add(waits, 0.0)
+    (refused,) = schedule.add(request(within=0.001, firm=True, session="arm", source=2), 0.0)
+    assert refused.kind == "late" and schedule.waits("arm")
+    # a newer one doesn't wait for the one that it replaces
+    assert [one.request for one in schedule.add(request(within=0.021, firm=True, session="arm"), 0.0)] == [waits]
+
+
+@dataclass
+class Crowd:
+    """Clients that ask again so soon after each answer (`pause`) or refusal (`retry`, else the same).
+
+    others    how many; `each` requests at once; as sources that are always new if they `reconnect`
+    within    seconds of their deadlines
+    """
+
+    others: int
+    pause: float = 0.001
+    retry: float | None = None
+    within: float = 1.0
+    firm: bool = False
+    each: int = 1
+    reconnect: bool = False
+    priority: Priority = ROBOT
+
+
+def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, limit: int = 16) -> float:
+    """The part of a robot's requests that get answers in time, beside a crowd and other robots; the worst one's.
+
+    Turns take 20 ms. Each robot asks five times a second, with jitter, but not before it is answered. `robots` has
+    their deadlines; None: the default one of a second, which isn't their own.
+    """
+    schedule, randoms, events, order = Schedule(limit, table({1: 0.02})), Random(0), list[Any](), count()
+    asked, good, now, wake = [0] * len(robots), [0] * len(robots), 0.0, -1.0
+
+    def at(when: float, what: str, who: Any) -> None:
+        heappush(events, (when, next(order), what, who))
+
+    def replied(one: Request, answered: bool) -> None:
+        kind, number = one.call
+        if kind == "robot":
+            good[number] += answered and now <= one.deadline
+            at(max(now, one.arrived + 0.2 * randoms.uniform(0.7, 1.3)), "ask", one.call)
+        else:
+            pause = crowd.pause if answered or crowd.retry is None else crowd.retry
+            at(now + pause * randoms.uniform(1, 1.1), "ask", one.call)
+
+    for number in range(crowd.others * crowd.each):
+        at(0.01 * randoms.random(), "ask", ("other", number % crowd.others))
+    for number in range(len(robots)):
+        at(1.0 + 0.013 * number, "ask", ("robot", number))
+    while now < seconds:
+        now, _, what, who = heappop(events)
+        if what == "ask":
+            if who[0] == "robot":
+                asked[who[1]] += 1
+                own = robots[who[1]]
+                one = Request(now, now + (own or 1.0), own is not None, source=who, call=who)
+            else:
+                source = object() if crowd.reconnect else who
+                one = Request(now, now + crowd.within, crowd.firm, crowd.priority, source, call=who)
+            for refused in schedule.add(one, now):
+                replied(refused.request, False)
+        elif what == "end":
+            schedule.freed(now, 0.02)
+            for one in who:
+                replied(one, True)
+        decision = schedule.decide(now)
+        for refused in decision.refused:
+            replied(refused.request, False)
+        if decision.turn:
+            at(now + 0.02, "end", decision.turn)
+        if decision.wake is not None and not now < wake <= decision.wake:
+            wake = max(now, decision.wake)
+            at(wake, "wake", None)
+    # what isn't answered yet, and the first request, in which nobody knows a robot, don't count
+    return min((got + 2) / ask for got, ask in zip(good, asked, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("others", "pause"),
+    [(17, 0.001), (24, 0.01), (40, 0.01), (17, 0.1), (40, 0.05), (40, 0.1), (150, 0.05), (150, 0.1)],
+)
+@pytest.mark.parametrize("own", [0.2, None], ids=["deadline", "plain"])
+def test_a_robot_is_served_beside_a_crowd_that_asks_again_at_once(others: int, pause: float, own: float | None) -> None:
+    assert beside(Crowd(others, pause), [own]) >= 0.95
+
+
+@pytest.mark.parametrize(
+    "crowd",
+    [
+        Crowd(40, 0.01, within=60.0, firm=True),
+        Crowd(40, 0.01, within=0.4, firm=True),
+        Crowd(40, 0.01, within=0.2, firm=True),
+        Crowd(40, 0.01, within=0.05, firm=True),
+        Crowd(40, 0.01, within=0.021, firm=True),
+        Crowd(40, 0.01, within=0.001, firm=True),
+        Crowd(40, 0.03, within=0.1, firm=True),
+        Crowd(40, 0.01, retry=0.1),
+        Crowd(17, 0.01, each=4),
+        Crowd(1, 0.01, each=40),
+        Crowd(40, 0.01, reconnect=True),
+        Crowd(40, 0.01, reconnect=True, within=0.05, firm=True),
+        Crowd(40, 0.01, priority=SIMULATOR),
+        Crowd(150, 0.3),
+        Crowd(150, 1.0),
+    ],
+    ids=str,
+)
+def test_no_crowd_takes_a_robots_turn(crowd: Crowd) -> None:
+    assert beside(crowd, [0.2]) >= 0.95
+
+
+def test_several_robots_are_served_beside_a_crowd() -> None:
+    assert beside(Crowd(40, 0.01), [0.2, None, 0.2, 0.1, 0.2]) >= 0.95
+    assert beside(Crowd(40, 0.01, within=0.2, firm=True), [0.2] * 5) >= 0.95
+    assert beside(Crowd(40, 0.01), [0.2], limit=4) >= 0.95
+
+
+def test_a_robot_in_a_crowd_of_others_like_it_has_its_share() -> None:
+    """150 that ask three times a second are too much: a robot that asks more often gets some answers, too."""
+    assert beside(Crowd(150, 0.3), [None], 12.0) >= 0.05
+
+
+def test_a_source_with_more_than_its_share_of_a_full_line_gives_way() -> None:
+    schedule = Schedule(4, table({1: T1}))
+    schedule.add(request(source=9), 0.0)
+    begin(schedule, 0.0)
+    greedy = [request(source=1, within=0.5) for _ in range(3)]
+    for one in (*greedy, request(source=2, within=2.0)):
+        assert schedule.add(one, 0.0) == []
+    (refused,) = schedule.add(request(source=3, within=3.0), 0.0)
+    assert refused.request is greedy[-1] and "gave its place" in refused.text
+
+
+def test_a_source_that_is_slowed_has_no_claim_from_its_pauses() -> None:
+    schedule = Schedule(1, table({1: T1}))
+    schedule.add(request(source=9), 0.0)
+    begin(schedule, 0.0)
+    for source in (1, 2):  # both pause until 0.5
+        schedule.add(first := request(0.0, source=source), 0.0)
+        schedule.remove(first)
+    slowed = request(0.5, source=1)
+    slowed.slowed = True
+    assert schedule.add(slowed, 0.5) == []
+    assert [one.request for one in schedule.add(request(0.5, source=2), 0.5)] == [slowed]
 
 
 def test_a_message_of_many_rows_keeps_its_place() -> None:
@@ -735,12 +893,35 @@ def test_without_measurements_there_are_no_batches() -> None:
     assert times.best(8, 0.0) == 1 and times.measured_largest == 1
 
 
-def test_a_size_that_failed_is_not_formed_any_more() -> None:
+def test_a_size_that_warm_up_could_not_measure_is_never_formed() -> None:
     times = table(PAYING)
-    times.failed(8)
+    times.limit(7)
     assert times.best(8, 0.0) == 4 and times.measured_largest == 4
-    times.failed(2)
+    times.limit(1)
     assert times.best(8, 0.0) == 1
+
+
+def test_a_size_that_failed_while_serving_is_tried_again_later_each_time() -> None:
+    times, now = table(PAYING), 0.0
+    for pause in (1.0, 2.0, 4.0, 8.0):
+        assert times.failed(8, now) == pause
+        assert times.best(8, now) == times.formed_largest(now) == 4 and times.measured_largest == 8
+        assert times.best(8, now + 0.99 * pause) == 4
+        now += pause
+        assert times.best(8, now) == 8
+        times.ran(4, 0.022, now)  # says nothing of larger ones
+    for _ in range(20):
+        times.failed(8, now)
+    assert times.failed(8, now) == LONGEST_PAUSE
+    times.ran(8, 0.038, now + LONGEST_PAUSE)
+    assert times.best(8, now + LONGEST_PAUSE) == 8 and times.failed(8, now + LONGEST_PAUSE) == PAUSE
+
+
+def test_while_a_size_pauses_smaller_ones_may_fail_too() -> None:
+    times = table(PAYING)
+    times.failed(8, 0.0)
+    times.failed(2, 0.5)
+    assert times.best(8, 1.1) == 1 and times.best(8, 2.5) == 8
 
 
 def test_a_gain_of_a_few_percent_is_none() -> None:
@@ -762,13 +943,13 @@ def test_what_was_looked_up_before_changes_no_answer(events: list[tuple[str, int
             elif told == "measured":
                 fresh.measured(size, 0.009 * size)
             elif told == "failed":
-                fresh.failed(size)
+                fresh.failed(size, at)
         if what == "ran":
             times.ran(rows, 0.011 * rows, now)
         elif what == "measured":
             times.measured(rows, 0.009 * rows)
         elif what == "failed":
-            times.failed(rows)
+            times.failed(rows, now)
         for size in (1, 3, 8):
             assert times.seconds(size, now) == fresh.seconds(size, now)
             assert times.best(size, now) == fresh.best(size, now)

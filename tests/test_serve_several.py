@@ -370,7 +370,7 @@ def test_batches_that_fail_for_themselves_are_given_up_and_their_observations_ru
             waiting = [await line.wait("short" if how != "raises" else str(number)) for number in range(2)]
             await line.go()
             assert [isinstance(await answer(one), dict) for one in waiting] == [True, True]
-            assert len(policy.batches) == 1 and times_of(server).measured_largest == 1
+            assert len(policy.batches) == 1 and times_of(server).formed_largest(0.0) == 1
 
     served(test, policy_class=BatchingFakePolicy)
 

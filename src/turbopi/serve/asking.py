@@ -71,6 +71,7 @@ class Askings:
                 firm=urgency.firm,
                 priority=urgency.priority,
                 source=connection.id,
+                slowed=connection.slowed,
                 session=plan.name,
                 rows=rows,
                 later=later,

@@ -8,6 +8,9 @@ KEPT = 50  # times of one size, the last ones
 FEW = 3  # recent runs that a size needs: with fewer, its times of the warm-up count
 FRESH_SECONDS = 60.0  # a size that didn't run for so long has its times of the warm-up again
 GAIN = 0.95  # a batch must take less than 0.95 * B * T(1): measurement noise of a few percent must form none
+# Seconds without batches of a size that failed: the first time, and at most, as each failure doubles them. Memory that
+# another program took for a moment is back soon; batches that never fit cost a failed run every ten minutes.
+PAUSE, LONGEST_PAUSE = 1.0, 600.0
 TYPICAL, SAFE = 0.5, 0.95  # quantiles: what is expected; what nearly every run keeps
 
 
@@ -52,6 +55,11 @@ class BatchTimes:
         self._recent: dict[int, _Times] = {}
         # Answers that were given, as the schedule asks the same again and again while clients wait. They hold from the
         # one moment to the other, and until a time is added.
+        self._failed, self._failed_until, self._pause = (
+            0,
+            -math.inf,
+            PAUSE,
+        )  # the size that failed, for how long it counts
         self._seconds: dict[tuple[int, float], float | None] = {}
         self._totals: dict[int, float] = {}
         self._found_from, self._found_until = math.inf, -math.inf
@@ -64,17 +72,39 @@ class BatchTimes:
     def ran(self, rows: int, seconds: float, now: float) -> None:
         """A run for requests, which ended at `now`."""
         self._recent.setdefault(rows, _Times()).add(seconds, now)
+        if self._failed and rows >= self._failed:
+            self._failed, self._failed_until, self._pause = 0, -math.inf, PAUSE
         self._forget()
 
-    def failed(self, rows: int) -> None:
-        """A batch of that size failed, and not by an observation's fault: neither it nor a larger one is formed."""
-        self.largest = min(self.largest, max(1, rows - 1))
+    def limit(self, rows: int) -> None:
+        """No batches of more, ever: warm-up couldn't measure them."""
+        self.largest = min(self.largest, max(1, rows))
         self._forget()
+
+    def failed(self, rows: int, now: float) -> float:
+        """A batch failed, and not by an observation's fault: for a while neither its size nor a larger one is formed.
+
+        Returns for how many seconds: twice as long as before, until a batch of the size works again.
+        """
+        self._failed = min(self._failed or rows, rows)
+        pause, self._pause = self._pause, min(2 * self._pause, LONGEST_PAUSE)
+        self._failed_until = now + pause
+        self._forget()
+        return pause
+
+    def formed_largest(self, now: float) -> int:
+        """The largest batch that may be formed now: none as large as one that failed a moment ago."""
+        if now < self._failed_until:
+            return self._measured_up_to(min(self.largest, self._failed - 1))
+        return self.measured_largest
 
     @property
     def measured_largest(self) -> int:
         """The largest batch that may be formed at all; 1 if none was measured."""
-        return max((rows for rows in self._warm if rows <= self.largest), default=1)
+        return self._measured_up_to(self.largest)
+
+    def _measured_up_to(self, most: int) -> int:
+        return max((rows for rows in self._warm if rows <= most), default=1)
 
     @property
     def sizes(self) -> list[int]:
@@ -100,6 +130,8 @@ class BatchTimes:
             self._found_until = min(
                 (times.last + FRESH_SECONDS for times in self._recent.values() if times.reliable(now)), default=math.inf
             )
+            if now < self._failed_until:
+                self._found_until = min(self._found_until, math.nextafter(self._failed_until, now))
 
     def _times(self, rows: int, now: float) -> _Times | None:
         good = {size: times for size, times in self._recent.items() if times.reliable(now)}
@@ -114,7 +146,7 @@ class BatchTimes:
 
         longest  seconds that the run may take; one observation may take longer
         """
-        most = min(rows, self.measured_largest)
+        most = min(rows, self.formed_largest(now))
         alone = self.seconds(1, now) if most > 1 else None
         if alone is None:
             return 1

@@ -193,7 +193,7 @@ class PolicyCalls:
                 logger.warning("no %s of %d and more: %s: %s", what, size, type(error).__name__, error)
                 enough = False
             if not enough:
-                times.failed(size)
+                times.limit(size - 1)
                 break
         measured = times.measured_largest
         table = ", ".join(f"{size}: {(times.seconds(size, 0.0) or 0) * 1e3:.1f}" for size in times.sizes)
@@ -353,8 +353,8 @@ class PolicyCalls:
         outcomes = [self._infer(*one) for one in zip(observations, arguments, strict=True)]
         if all(outcome.wrong != "policy" for outcome in outcomes):  # it was the batch's fault, not one observation's
             joins = " that join chunks" if any(arguments) else ""
-            logger.warning("batches of %d and more%s aren't formed any more", rows, joins)
-            (self.joining if joins else self.times).failed(rows)
+            pause = (self.joining if joins else self.times).failed(rows, time.perf_counter())
+            logger.warning("batches of %d and more%s aren't formed for %g s", rows, joins, pause)
         return outcomes
 
     def _submit(self, observation: dict[str, object]) -> "Future[list[Outcome]]":

@@ -114,6 +114,11 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
     # --- what the server calls ----------------------------------------------------------------------------------------
 
+    @property
+    def slowed(self) -> bool:
+        """Whether it is read more slowly than its client sends: then its pauses aren't the client's."""
+        return self._credit.slowed
+
     def opened(self) -> None:
         """The handshake is done."""
         self.start_keepalive()

@@ -119,6 +119,11 @@ class Credit:
         self._slowed = False
 
     @property
+    def slowed(self) -> bool:
+        """Whether it caused more work without getting actions than is allowed on and on."""
+        return self._slowed
+
+    @property
     def spent(self) -> bool:
         """Whether nothing more should be read now."""
         return self._level <= 0 or self._clock() < self._opens

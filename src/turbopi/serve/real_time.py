@@ -8,8 +8,8 @@ docs/serving.md says from what; what isn't known is refused, never guessed.
 
 import math
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,8 +24,8 @@ from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 
 NO_JOINING = "none"  # a mode: the session is there for the order of its requests alone
-MAX_SESSIONS = 256  # named ones; a connection's own ends with it
-IDLE_SECONDS = 300.0  # a named session that nobody used for so long is dropped
+MAX_SESSIONS = 256  # named ones with a chunk; a connection's own ends with it
+IDLE_SECONDS = 300.0  # a named session that got no chunk for so long is dropped
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,11 @@ class _Kept:
 
 @dataclass
 class _Session:
-    used: float
     kept: _Kept | None = None
+    used: float = 0.0  # when it got its chunk
+    connection: Hashable = None  # that asked for the chunk; None: it has ended
     delays: DelayEstimate = field(default_factory=DelayEstimate)
-    holder: "Plan | None" = None  # the request that is to have its next chunk
+    pending: "list[Plan]" = field(default_factory=list)  # requests that aren't released yet
 
 
 @dataclass
@@ -59,11 +60,15 @@ class Plan:
     session: _Session | None = None
     name: str | None = None  # of the session
     received: float = 0.0
+    connection: Hashable = None
     about: dict[str, Any] = field(default_factory=dict)  # what the answer says of it, under "real_time"
 
 
 class RealTime:
     """Plans each request for one policy, and keeps the sessions' running chunks. For the event loop's thread alone.
+
+    A request alone keeps nothing: a session stays only once it has a chunk. So requests that are refused, however many
+    and of whatever names, end no session of others.
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
@@ -82,11 +87,12 @@ class RealTime:
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
-        self._named: OrderedDict[Hashable, _Session] = OrderedDict()  # the one used last at the end
+        # Those with a chunk, the one that got its chunk last at the end, and those with a request alone.
+        self._named: OrderedDict[str, _Session] = OrderedDict()
         self._of_connections: dict[Hashable, _Session] = {}
         self._horizon: int | None = metadata.get("action_horizon")
         check_execution(options, self._offered, self._horizon)
-        metrics.watch_sessions(lambda: len(self._named) + len(self._of_connections))
+        metrics.watch_sessions(lambda: sum(one.kept is not None for one in self._all()))
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -179,17 +185,22 @@ class RealTime:
         self, observation: dict[str, Any], asked: Asked, mode: JoinMode, connection: Hashable, now: float
     ) -> Plan:
         session = self._session(asked, connection, now)
-        if asked.reset:
-            session.kept = None
+        kept = None if asked.reset else session.kept
         previous, about = None, {"joined": False, "mode": mode}
-        if session.kept is not None:
-            previous, more = self._previous(session, session.kept, asked, mode, now)
+        if kept is not None:
+            previous, more = self._previous(session, kept, asked, mode, now)
             about |= more
         elif asked.step is None:
             self._need_control_hz()
         arguments = {"previous": previous, "model_actions": True, **_seed(asked)}
-        session.holder = Plan(observation, arguments, asked, session, asked.session, now, about)
-        return session.holder
+        plan = Plan(observation, arguments, asked, session, asked.session, now, connection, about)
+        session.kept = kept
+        session.pending.append(plan)
+        if asked.session is None:
+            self._of_connections[connection] = session
+        else:
+            self._named.setdefault(asked.session, session)
+        return plan
 
     def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request, of the policy's result."""
@@ -200,7 +211,7 @@ class RealTime:
         if session is not None:
             now = self._clock()
             model_actions = np.asarray(result["model_actions"], np.float32)
-            session.kept = _Kept(model_actions, result.get("anchor"), plan.asked.step, plan.received)
+            self._keep(_Kept(model_actions, result.get("anchor"), plan.asked.step, plan.received), plan, session, now)
             if self._options.control_hz is not None:
                 session.delays.add(math.ceil(round((now - plan.received) * self._options.control_hz, 6)))
         if previous is not None:
@@ -214,49 +225,68 @@ class RealTime:
 
     def release(self, plan: Plan) -> None:
         """The session may have its next request. Without a result its robot goes on with the chunk it has."""
-        if plan.session is not None and plan.session.holder is plan:  # no newer one has replaced it
-            plan.session.holder = None
-            plan.session.used = self._clock()
+        session = plan.session
+        if session is None:
+            return
+        session.pending.remove(plan)
+        if session.kept is None and not session.pending and self._named.get(plan.name or "") is session:
+            del self._named[plan.name or ""]
 
     def closed(self, connection: Hashable) -> None:
         """A connection has ended, and its own session with it."""
-        if self._of_connections.pop(connection, None) is not None:
+        own = self._of_connections.pop(connection, None)
+        if own is not None and own.kept is not None:
             self._metrics.session_dropped("closed")
+        for session in self._named.values():
+            if session.connection == connection:
+                session.connection = None
 
     # --- sessions -----------------------------------------------------------------------------------------------------
 
+    def _all(self) -> Iterable[_Session]:
+        return (*self._named.values(), *self._of_connections.values())
+
     def _session(self, asked: Asked, connection: Hashable, now: float) -> _Session:
+        """The session of a request, which may be new: then it isn't kept yet."""
         self._drop_idle(now)
         if asked.session is None:
-            return self._of_connections.setdefault(connection, _Session(now))
-        session = self._named.get(asked.session)
-        if session is None:
-            if len(self._named) >= MAX_SESSIONS:
-                self._drop_oldest()
-            session = self._named[asked.session] = _Session(now)
-        self._named.move_to_end(asked.session)
-        if session.holder is not None and not self._waits(asked.session):
+            return self._of_connections.get(connection) or _Session()
+        session = self._named.get(asked.session) or _Session()
+        if session.pending and not self._waits(asked.session):
             raise ObservationError(
                 f"session {asked.session!r} has a request that isn't answered yet: give each robot its own session"
             )
-        session.used = now
         return session
 
-    def _drop_idle(self, now: float) -> None:
-        while self._named:
-            name, oldest = next(iter(self._named.items()))
-            if oldest.holder is not None or now - oldest.used <= IDLE_SECONDS:
-                return
-            del self._named[name]
-            self._metrics.session_dropped("idle")
+    def _keep(self, kept: _Kept, plan: Plan, session: _Session, now: float) -> None:
+        """A session has got its chunk. A named one may have to make room for it."""
+        session.kept, session.used, session.connection = kept, now, plan.connection
+        if plan.name is None:
+            return
+        self._named[plan.name] = session  # again, if it was dropped meanwhile
+        self._named.move_to_end(plan.name)
+        others = [name for name, one in self._named.items() if one.kept is not None and one is not session]
+        if len(others) >= MAX_SESSIONS:
+            self._drop(self._least_missed(others), "full")
 
-    def _drop_oldest(self) -> None:
-        for name, session in self._named.items():
-            if session.holder is None:
-                del self._named[name]
-                self._metrics.session_dropped("full")
+    def _least_missed(self, names: list[str]) -> str:
+        """Of those whose connection has the most sessions, the one that got its chunk longest ago.
+
+        Sessions whose connection has ended count as those of one connection. One with a request is spared if possible.
+        """
+        of = Counter(self._named[name].connection for name in names)
+        return min(names, key=lambda name: (bool(self._named[name].pending), -of[self._named[name].connection]))
+
+    def _drop_idle(self, now: float) -> None:
+        for name, session in tuple(self._named.items()):
+            if session.kept is not None and now - session.used <= IDLE_SECONDS:
                 return
-        raise ObservationError(f"all {MAX_SESSIONS} sessions have requests that aren't answered yet: try again")
+            if not session.pending:
+                self._drop(name, "idle")
+
+    def _drop(self, name: str, why: str) -> None:
+        del self._named[name]
+        self._metrics.session_dropped(why)
 
     # --- the running chunk --------------------------------------------------------------------------------------------
 

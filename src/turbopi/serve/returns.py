@@ -6,6 +6,7 @@ come back together after a batch, a few milliseconds later. schedule.py waits fo
 
 from collections import OrderedDict, deque
 from collections.abc import Container, Hashable
+from dataclasses import dataclass
 
 KEPT = 5  # returns of a source, the last ones
 FEW = 2  # that tell something
@@ -14,6 +15,7 @@ TYPICAL = 3 / 4  # the quantile of the kept ones that counts as a source's usual
 LATER = 2.0
 LATER_SECONDS = 0.0005
 MOST = 1024  # sources that are remembered
+MEAN_OF = 4  # a new pause counts as one of so many
 
 
 class Returns:
@@ -61,3 +63,51 @@ class Returns:
         if seconds is None or len(seconds) < FEW:
             return None
         return sorted(seconds)[min(len(seconds) - 1, int(TYPICAL * len(seconds)))]
+
+
+@dataclass
+class _Source:
+    event: float  # its last request, answer or refusal
+    served: float  # its last answer; before that, when it came first
+    usual: float  # its pauses, as parts of a long one: a mean of the last few
+    pauses: int = 0  # in that mean
+
+
+class Pauses:
+    """How long sources usually pause before they ask, and when they were served last."""
+
+    def __init__(self) -> None:
+        self._sources: OrderedDict[Hashable, _Source] = OrderedDict()  # the one with the last event at the end
+
+    def asked(self, source: Hashable, long: float, new: float, now: float) -> tuple[float, float]:
+        """A request has come. Its source's usual pause, from 0 to 1, and when that was served last or came first.
+
+        long  seconds of a pause that counts as 1
+        new   the pause of a source that wasn't seen lately
+        """
+        known = self._sources.get(source)
+        if known is None:
+            known = self._sources[source] = _Source(now, now, new)
+            if len(self._sources) > MOST:
+                self._sources.popitem(last=False)
+        else:
+            pause = now - known.event
+            known.pauses = min(known.pauses + 1, MEAN_OF)
+            known.usual += ((1.0 if pause >= long else pause / long) - known.usual) / known.pauses
+            self._note(source, known, now)
+        return known.usual, known.served
+
+    def replied(self, source: Hashable, now: float) -> None:
+        """A request of the source was refused."""
+        if (known := self._sources.get(source)) is not None:
+            self._note(source, known, now)
+
+    def served(self, source: Hashable, now: float) -> None:
+        """A turn with a request of the source has ended."""
+        if (known := self._sources.get(source)) is not None:
+            known.served = now
+            self._note(source, known, now)
+
+    def _note(self, source: Hashable, known: _Source, now: float) -> None:
+        known.event = now
+        self._sources.move_to_end(source)

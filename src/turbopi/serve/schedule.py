@@ -1,11 +1,20 @@
 """Whose turn it is: earliest deadline first, robots before simulators, batches where they pay.
 
+When more ask than can be served (a place or a firm deadline was refused within CROWDED_SECONDS), claims come before
+deadlines. A source's claim is how long it usually pauses before it asks, from its last request, answer or refusal on;
+LONG turns are as good as any longer pause. So a robot that asks five times a second has a strong claim, and a client
+that asks again at once has a weak one, however often it was refused. Of about equal claims the earlier deadline
+decides. The order goes by this, and so does who gives way in a full line: simulators to robots, then a source that
+has more than its share of the places, then the weakest claim, then the latest deadline. A quarter of the places are
+safe: those of the sources that were served longest ago, so that nobody is refused for ever. Neither a short deadline
+nor a new connection is a claim.
+
 A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py asks `decide`
 whenever something has changed or the moment `Decision.wake` has come, and runs the turn that it is given.
 
 What holds:
 
-- Requests with the same deadline, priority and size run in the order in which they came.
+- Requests with the same deadline, priority, size and, in a crowd, claim run in the order in which they came.
 - A request may be overtaken (a turn goes to one that came later) OVERTAKEN times. Of those that were, the one that came
   first gets every other turn at least: nobody starves, not even simulators.
 - What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
@@ -14,14 +23,15 @@ What holds:
 """
 
 import math
-from collections import OrderedDict, deque
-from collections.abc import Hashable, Iterable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from statistics import median
 from typing import Any, Literal
 
 from turbopi.serve.batch_times import SAFE, BatchTimes
-from turbopi.serve.returns import Returns
+from turbopi.serve.returns import Pauses, Returns
 
 Priority = Literal["robot", "simulator"]
 PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
@@ -32,6 +42,11 @@ TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of
 GAPS = 32  # times between two arrivals, the last ones: their median is how soon company comes
 LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late timer must not shrink the batch
 PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
+CROWDED_SECONDS = 1.0
+LONG = 8.0  # turns: who pauses so long takes a ninth of the policy's time at most
+NEW = 1 / 16  # the claim of a source that wasn't seen lately: weaker than a robot's
+WEAKEST = 12  # levels of claims, from 0; one is a factor of √2
+SAFE_PLACES = 1 / 4  # of the line: those of the sources that were served longest ago
 LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
 
 
@@ -62,10 +77,15 @@ class Request:
     alone: bool = False
     joins: bool = False
     continued: bool = False  # of a message that has its place in the line already
+    slowed: bool = False  # its source is read more slowly than it sends: its pauses say nothing, and it has no claim
     call: Any = None
     number: int = field(default=0, init=False)  # in the order in which they came
     overtaken: int = field(default=0, init=False)
+    order: tuple[float, ...] = field(default=(), init=False)  # robots, then the earliest deadline, then who came first
+    in_crowd: tuple[float, ...] = field(default=(), init=False)  # the same, with the claim before the deadline
     queued: float = field(default=0.0, init=False)  # when it was added
+    level: int = field(default=WEAKEST, init=False)  # of its claim; 0 is the strongest
+    served: float = field(default=0.0, init=False)  # when its source was answered last, or came first
 
 
 @dataclass(frozen=True)
@@ -89,6 +109,10 @@ class Decision:
     turn: tuple[Request, ...] = ()
     refused: tuple[Refused, ...] = ()
     wake: float | None = None
+
+
+_ORDER: Callable[[Request], tuple[float, ...]] = attrgetter("order")
+_IN_CROWD: Callable[[Request], tuple[float, ...]] = attrgetter("in_crowd")
 
 
 class _Recent:
@@ -143,6 +167,8 @@ class Schedule:
         self._last_arrival = -math.inf
         self._gaps: deque[float] = deque(maxlen=GAPS)
         self._returns = Returns()
+        self._pauses = Pauses()
+        self.crowded_until = -math.inf  # claims come before deadlines until then
 
     @property
     def waiting(self) -> int:
@@ -161,21 +187,24 @@ class Schedule:
 
     def add(self, request: Request, now: float) -> list[Refused]:
         """A request has come. Those that are refused for it: an older one, or itself."""
-        refused = self._replace(request)
         self._note(request, now)
         if (late := self._late_on_arrival(request, now)) is not None:
-            return [*refused, late]
+            return self._refuse([late], now)
+        refused = self._replace(request)
         if not request.continued and self.waiting >= self._places:
+            self.crowded_until = now + CROWDED_SECONDS
             gives_way = self._gives_way(request)
             text = f"busy: {self.queue_limit} requests wait already (--queue-limit {self.queue_limit}); try again"
+            if gives_way is not request:
+                text += " later: this one gave its place to another that pauses longer, or is more urgent"
+                self._waiting.remove(gives_way)
             refused.append(Refused(gives_way, "busy", text))
             if gives_way is request:
-                return refused
-            self._waiting.remove(gives_way)
+                return self._refuse(refused, now)
         self._waiting.append(request)
         if request.firm and request.priority == "robot":
             self._tight.note(request.source, request.deadline - request.arrived, now)
-        return refused
+        return self._refuse(refused, now)
 
     def remove(self, request: Request) -> None:
         """Nobody waits for its answer any more."""
@@ -203,6 +232,7 @@ class Schedule:
         for request in self._running:
             if not request.later:
                 self._returns.answered(request.source, now)
+                self._pauses.served(request.source, now)
         self._running, self._free_since = (), now
 
     @property
@@ -216,10 +246,29 @@ class Schedule:
         text = f"replaced: a newer observation of session {request.session!r} came before this one had its turn"
         return [Refused(one, "replaced", text) for one in older]
 
+    def _refuse(self, refused: list[Refused], now: float) -> list[Refused]:
+        """A source that was refused begins its pause anew."""
+        for one in refused:
+            self._pauses.replied(one.request.source, now)
+        return refused
+
     def _gives_way(self, request: Request) -> Request:
-        """Who gets no place, as all are taken: for a robot, the last of the simulators."""
-        simulators = [one for one in self._waiting if one.priority == "simulator"]
-        return max(simulators, key=_order) if request.priority == "robot" and simulators else request
+        """The one of a full line and a newcomer that gets no place; the module says by which rule."""
+        some = [one for one in self._waiting if not one.continued]
+        some.append(request)
+        if any(one.priority != request.priority for one in some):
+            some = [one for one in some if one.priority == "simulator"]
+        places = Counter([one.source for one in self._waiting])
+        places[request.source] += 1
+        most = max([places[one.source] for one in some])
+        if most > max(1, self._places // len(places)):
+            return min([one for one in some if places[one.source] == most], key=_strength)
+        weakest = min(some, key=_strength)
+        safe = int(len(some) * SAFE_PLACES)
+        if not safe or sum([one.served < weakest.served for one in some]) >= safe:
+            return weakest
+        longest_ago = sorted(some, key=lambda one: one.served)[:safe]
+        return min([one for one in some if one not in longest_ago], key=_strength)
 
     def _note(self, request: Request, now: float) -> None:
         """Give it its number, and learn how soon others follow."""
@@ -227,6 +276,11 @@ class Schedule:
         request.number, request.queued = self._number, now
         if not request.continued:
             self._returns.asked(request.source, now)
+            claim, request.served = self._pauses.asked(request.source, LONG * self._seconds(request, now), NEW, now)
+            request.level = min(WEAKEST, int(-2 * math.log2(claim))) if claim > 0 and not request.slowed else WEAKEST
+        priority = PRIORITIES.index(request.priority)
+        request.order = priority, request.deadline, request.number
+        request.in_crowd = priority, request.level, request.deadline, request.number
         if not (request.alone or request.continued):
             if now - self._last_arrival <= ACTIVE_SECONDS:
                 self._gaps.append(now - self._last_arrival)
@@ -238,7 +292,8 @@ class Schedule:
     def _late_on_arrival(self, request: Request, now: float) -> Refused | None:
         if not request.firm:
             return None
-        before = [one for one in self._waiting if _order(one) < _order(request)]
+        order = self._order(now)
+        before = [one for one in self._waiting if order(one) < order(request)]
         others = [one for one in before if not one.alone]
         together = sum(one.rows for one in others)
         wait = self._until_free(now) + sum(self._turn_seconds((one,), now) for one in before if one.alone)
@@ -248,19 +303,19 @@ class Schedule:
             wait += max(0.0, self._times((*others, request)).total(rows, now) - run)
         else:
             wait += self._turn_seconds(others, now)
-        return self._late(request, now, wait, run) if now + wait + run > request.deadline else None
+        if now + wait + run <= request.deadline:
+            return None
+        if before:
+            self.crowded_until = now + CROWDED_SECONDS
+        return self._late(request, now, wait, run)
 
     def _hopeless(self, now: float) -> list[Refused]:
         """Those that wait and can't meet their deadline any more; they wait no longer."""
-        refused = []
-        for request in tuple(self._waiting):
-            if not request.firm:
-                continue
-            wait, run = self._until_free(now), self._seconds(request, now)
-            if now + wait + run > request.deadline:
-                self._waiting.remove(request)
-                refused.append(self._late(request, now, wait, run))
-        return refused
+        wait = self._until_free(now)
+        late = [one for one in self._waiting if one.firm and now + wait + self._seconds(one, now) > one.deadline]
+        for one in late:
+            self._waiting.remove(one)
+        return self._refuse([self._late(one, now, wait, self._seconds(one, now)) for one in late], now)
 
     def _until_free(self, now: float) -> float:
         """Seconds until the running turn is expected to end."""
@@ -268,7 +323,7 @@ class Schedule:
 
     def _seconds(self, request: Request, now: float) -> float:
         """From the beginning of its turn to the actions of all rows of its message, if they run on their own."""
-        return self._times((request,)).total(request.rows + request.later, now)
+        return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
 
     def _turn_seconds(self, requests: Iterable[Request], now: float) -> float:
         """For how long turns of these, which may run together, keep others from theirs."""
@@ -297,6 +352,10 @@ class Schedule:
         moments = [request.deadline - self._seconds(request, now) + LATER for request in self._waiting if request.firm]
         return min(moments, default=None)
 
+    def _order(self, now: float) -> Callable[[Request], tuple[float, ...]]:
+        """Robots first, then in a crowd the strongest claim, then the earliest deadline, then who came first."""
+        return _IN_CROWD if now < self.crowded_until else _ORDER
+
     # --- turns --------------------------------------------------------------------------------------------------------
 
     def decide(self, now: float) -> Decision:
@@ -305,8 +364,8 @@ class Schedule:
         wake = self._next_hopeless(now)
         if self._running or not self._waiting:
             return Decision((), refused, wake)
-        head, exhausted = self._head()
-        group = self._company(head)
+        head, exhausted = self._head(now)
+        group = self._company(head, now)
         rows = sum(request.rows for request in group)
         until = -math.inf if exhausted or head.alone or len(group) < self.waiting else self._window(group, rows, now)
         if until > now:
@@ -322,20 +381,20 @@ class Schedule:
         refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
         return Decision(turn, refused, self._next_hopeless(now))
 
-    def _head(self) -> tuple[Request, bool]:
+    def _head(self, now: float) -> tuple[Request, bool]:
         """Whose turn it is, and whether that is because it was overtaken too often: such turns aren't two in a row."""
         exhausted = [request for request in self._waiting if request.overtaken >= OVERTAKEN]
         others = [request for request in self._waiting if request.overtaken < OVERTAKEN]
         if exhausted and not (self._exhausted_last and others):
             return min(exhausted, key=lambda request: request.number), True
-        return min(others, key=_order), False
+        return min(others, key=self._order(now)), False
 
-    def _company(self, head: Request) -> list[Request]:
+    def _company(self, head: Request, now: float) -> list[Request]:
         """The head, and behind it in their order those that may run together with it."""
         if head.alone:
             return [head]
         others = (one for one in self._waiting if one is not head and not one.alone and one.priority == head.priority)
-        return [head, *sorted(others, key=_order)]
+        return [head, *sorted(others, key=self._order(now))]
 
     def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
         """The first of a group, as many as pay and as keep the deadlines.
@@ -386,7 +445,7 @@ class Schedule:
         """
         times = self._times(group)
         sources = {request.source for request in group}
-        places = min(self._places - len(group), times.measured_largest - rows)
+        places = min(self._places - len(group), times.formed_largest(now) - rows)
         if places < 1:
             return -math.inf
         opened = max(self._free_since, min(request.arrived for request in group))
@@ -416,6 +475,6 @@ class Schedule:
         return min(until, self._last_arrival + PATIENCE * gap)
 
 
-def _order(request: Request) -> tuple[int, float, int]:
-    """Who comes first: robots, then the earliest deadline, then who came first."""
-    return PRIORITIES.index(request.priority), request.deadline, request.number
+def _strength(request: Request) -> tuple[int, float, int]:
+    """Smallest for the one that gives its place to another."""
+    return -request.level, -request.deadline, -request.number

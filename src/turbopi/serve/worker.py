@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import queue
 import threading
 import time
@@ -15,8 +16,11 @@ from typing import Any, TypeVar
 from turbopi.serve.outcome import Outcome
 from turbopi.serve.schedule import Refused, Request, Schedule
 
+logger = logging.getLogger(__name__)
+
 R = TypeVar("R")
 
+DRAIN_SECONDS = 10.0
 STOPPING = Outcome(0.0, wrong="stopping", text="the server is shutting down")
 
 
@@ -100,10 +104,23 @@ class Worker:
         self._set_timer(None)
 
     async def drain(self) -> None:
-        """Wait for the running turn to end, if there is one, and for all that turns began. Call `stop` first."""
-        while self.running:
-            self._idle = asyncio.get_running_loop().create_future()
-            await self._idle
+        """Wait for the running turn to end, if there is one, and for all that turns began. Call `stop` first.
+
+        A policy that never ends holds nobody: after DRAIN_SECONDS and twice its usual time the log says so, and its
+        requests are turned away.
+        """
+        if not self.running:
+            return
+        usual = self.schedule.times.seconds(1, time.perf_counter()) or 0.0
+        seconds = DRAIN_SECONDS + 2 * usual * max(self._turns, len(self._going))
+        self._idle = asyncio.get_running_loop().create_future()
+        try:
+            await asyncio.wait_for(self._idle, seconds)
+        except asyncio.TimeoutError:
+            text = "stopping without %d calls of the policy, which haven't ended within %.0f s"
+            logger.error(text, self._turns + len(self._going), seconds)
+            for request in tuple(self._answers):
+                self._answer(request, [STOPPING])
 
     def close(self) -> None:
         """Let the thread end. It isn't waited for."""
