@@ -117,7 +117,7 @@ class UnifiedPolicy:
             vocab_size=checkpoint.config.model.vocab_size,
         )
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
-        for note in self._pipeline.notes:
+        for note in (*checkpoint.source.notes, *self._pipeline.notes):
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
 
