@@ -81,7 +81,7 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
             "kind": detect_kind(source, location.weights),
             "assets": asset_ids(location.folder / "assets"),
             **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
-            **{"action_dim": size for size in source.shapes.get("action_in_proj.weight", ())[1:2]},
+            **dict(zip(("action_dim",), source.shapes.get("action_in_proj.weight", ())[1:2], strict=False)),
             "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
             "config_error": str(error),
         }
