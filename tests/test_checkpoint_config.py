@@ -227,7 +227,7 @@ def test_config_jsons_horizon_is_a_hint_where_no_configuration_is_known(tmp_path
     write_json(folder / "config.json", {"action_horizon": 33})
     info = inspect_checkpoint(folder)
     assert info["action_dim"] == 32
-    assert "action_horizon = 33 (used: not known yet)" in info["notes"][0]
+    assert "action_horizon = 33 (used: the configuration's)" in info["notes"][0]
 
 
 def test_a_turbopi_json_that_config_replaces_is_a_note_where_it_differs(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfi
         return [f"openpi doesn't read {CONFIG}, nor does Turbo-Pi: {error}"]
     facts: dict[str, object] = {
         "precision": " and ".join(sorted(set(source.dtypes.values()))),
-        "action_horizon": "not known yet",
+        "action_horizon": "the configuration's",
     }
     if policy is not None:
         facts |= {
