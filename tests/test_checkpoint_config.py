@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from checkpoint_helpers import GOLDEN, LIBERO, jax_copy, read_tree, torch_copy, write_json
@@ -12,6 +13,7 @@ from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.checkpoint.settings import parse_values
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, Normalization, RealTime, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError
+from turbopi.policy import UnifiedPolicy
 
 PI05, PI0 = GOLDEN / "pi05" / "jax", GOLDEN / "pi0" / "jax"
 
@@ -228,6 +230,13 @@ def test_config_jsons_horizon_is_a_hint_where_no_configuration_is_known(tmp_path
     info = inspect_checkpoint(folder)
     assert info["action_dim"] == 32
     assert "action_horizon = 33 (used: the configuration's)" in info["notes"][0]
+
+
+def test_a_policy_logs_what_its_checkpoint_says_twice(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = torch_copy(tmp_path / "c")
+    write_json(folder / "config.json", {"action_dim": 7})
+    UnifiedPolicy(folder, backend="pytorch", device="cpu", tokenizer=Mock())
+    assert "config.json isn't read, nor does openpi read it. It says action_dim = 7 (used: 32)" in caplog.text
 
 
 def test_a_turbopi_json_that_config_replaces_is_a_note_where_it_differs(tmp_path: Path) -> None:

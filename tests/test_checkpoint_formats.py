@@ -203,6 +203,16 @@ def test_of_two_formats_in_a_folder_openpis_choice_is_read(tmp_path: Path, pi05:
     assert "params/ is read, as by openpi, and not" in both.source.notes[0]
 
 
+def test_files_behind_links_are_part_of_a_trees_fingerprint(tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(GOLDEN / "pi05" / "jax", folder)
+    names = {file.name for file in open_checkpoint(folder, "pi05_libero").source.files}  # type: ignore[attr-defined]
+    (linked,) = (entry for entry in (folder / "params").iterdir() if entry.is_dir() and entry.name.startswith("ocdbt"))
+    linked.rename(tmp_path / "elsewhere")
+    linked.symlink_to(tmp_path / "elsewhere")
+    assert {file.name for file in open_checkpoint(folder, "pi05_libero").source.files} == names  # type: ignore[attr-defined]
+
+
 def test_an_index_that_belongs_to_other_shards_is_refused(tmp_path: Path) -> None:
     folder = torch_copy(tmp_path / "copy")
     (folder / "model.safetensors").rename(folder / "one.safetensors")

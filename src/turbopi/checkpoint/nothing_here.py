@@ -54,8 +54,8 @@ def _answers(folder: Path) -> Iterator[str]:
             f"{folder / WEIGHTS} is a link to {(folder / WEIGHTS).readlink()}, which isn't there: the folder was "
             "copied without what its links lead to (cp -L follows them), or the download isn't finished"
         )
-    names = [file.relative_to(folder) for file in _some_below(folder, hidden=True) if file.suffix in _PARTIAL]
-    if partial := [str(name) for name in names if len(name.parts) == 1 or name.parts[0].startswith(".")]:
+    unready = [file.relative_to(folder) for file in _some_below(folder, hidden=True) if file.suffix in _PARTIAL]
+    if partial := [str(file) for file in unready if len(file.parts) == 1 or file.parts[0].startswith(".")]:
         yield f"the download into {folder} isn't finished: there is {listing(partial)}. Run it again"
     if pickled := _pickled(file for file in folder.glob("*") if file.is_file()):
         yield f"{folder} holds {listing([file.name for file in pickled])}: {_unpickle(pickled[0])}"
