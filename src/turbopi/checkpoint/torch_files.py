@@ -2,8 +2,8 @@
 
 A download that set its space aside and stopped leaves zeros, which safetensors can't tell from weights. So when a file
 is opened, one row in the middle of every matrix is read: some 400 rows of a few kilobytes, which loading reads anyway.
-A matrix whose row is zero is read whole. Biases aren't judged, nor are norms, whose
-scales (stored less 1) and adaRMS layers start as zeros.
+A matrix whose row is zero is read whole. Biases aren't judged, nor are norms, whose scales (stored less 1) and adaRMS
+layers start as zeros.
 """
 
 import re
