@@ -24,9 +24,17 @@ from turbopi.checkpoint.calibration import BESIDE, calibration_of, for_policy
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
-from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError, OutputError
+from turbopi.errors import (
+    BackendUnavailable,
+    CalibrationError,
+    CheckpointError,
+    ConfigError,
+    ObservationError,
+    OutputError,
+)
 from turbopi.examples import Example, NoisyExample, with_noises
 from turbopi.model.layers import AdaRMSNorm
+from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
@@ -191,6 +199,14 @@ def test_sites_stay_in_bf16_until_the_target_is_met() -> None:
     assert all(0.0005 < site.error < 0.04 for site in loose.sites.values())
     assert all((site.directions is None) == (site.kept is not None) for site in tight.sites.values())
     assert set(loose.report["groups_alone"]) == {site.group for site in sites(model.config)}
+
+
+def test_actions_without_a_signal_are_not_calibrated_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing varies every cosine is right, or NaN, which is below no target."""
+    monkeypatch.setattr(Pi0Model, "sample", lambda model, observation, noise, *args, **options: noise.clone())
+    model, own = golden_model("pi05"), golden_calls(golden_cases()["b_third_masked"])
+    with pytest.raises(CheckpointError, match="nothing to judge: the float32 reference's actions"):
+        run._Trials(model, own, 1, 1, run.Progress(), RoundedWeights())
 
 
 def test_directions_more_than_halve_the_error(monkeypatch: pytest.MonkeyPatch) -> None:

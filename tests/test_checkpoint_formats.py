@@ -2,13 +2,14 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import ml_dtypes
 import numpy as np
 import pytest
 import torch
-from checkpoint_helpers import GOLDEN, LIBERO, edit_tensors, jax_copy, read_tree, torch_copy, write_json
+from checkpoint_helpers import GOLDEN, LIBERO, edit_tensors, jax_copy, lerobot_copy, read_tree, torch_copy, write_json
 from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import Checkpoint, inspect_checkpoint, open_checkpoint
@@ -159,6 +160,126 @@ def test_shards_are_read_through_their_index(tmp_path: Path, pi05: Checkpoint) -
     (folder / "b.safetensors").unlink()
     with pytest.raises(CheckpointError, match=r"lists files that aren't there: b\.safetensors"):
         open_checkpoint(folder)
+
+
+@pytest.mark.parametrize("make", [torch_copy, lerobot_copy])
+@pytest.mark.parametrize("shards_are_there", [True, False])
+def test_the_single_file_is_read_and_not_the_shards_of_an_older_index(
+    tmp_path: Path, make: Callable[[Path], Path], shards_are_there: bool
+) -> None:
+    """As openpi, LeRobot and transformers do."""
+    folder = make(tmp_path / "copy")
+    write_json(folder / "turbopi.json", {"vision_heads": 4} | ({"preset": "pi05_libero"} if make is torch_copy else {}))
+    expected = open_checkpoint(folder)
+    old = {name: tensor + 1 for name, tensor in load_file(folder / "model.safetensors").items()}
+    if shards_are_there:
+        save_file(old, folder / "old.safetensors")
+    index = folder / "model.safetensors.index.json"
+    write_json(index, {"weight_map": dict.fromkeys(old, "old.safetensors")})
+    opened = open_checkpoint(folder)
+    assert opened.fingerprint() == expected.fingerprint()
+    assert [note for note in opened.source.notes if note not in expected.source.notes] == [
+        f"two sources of weights: model.safetensors is read, as by {'openpi' if make is torch_copy else 'LeRobot'}, "
+        f"and not {index}"
+    ]
+    write_json(index, {"weight_map": dict.fromkeys(old, "model.safetensors")})  # one source
+    assert open_checkpoint(folder).source.notes == expected.source.notes
+
+
+def test_of_two_formats_in_a_folder_openpis_choice_is_read(tmp_path: Path, pi05: Checkpoint) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    shutil.copytree(GOLDEN / "pi05" / "jax" / "params", folder / "params")
+    both = open_checkpoint(folder)
+    assert both.format == "openpi_torch"
+    assert both.source.notes == [
+        f"two sources of weights: model.safetensors is read, as by openpi, and not {folder / 'params'}"
+    ]
+    (folder / "config.json").unlink()
+    (folder / "model.safetensors").rename(folder / "one.safetensors")
+    names = load_file(folder / "one.safetensors")
+    write_json(folder / "model.safetensors.index.json", {"weight_map": dict.fromkeys(names, "one.safetensors")})
+    both = open_checkpoint(folder)
+    assert (both.format, len(both.source.notes)) == ("openpi_jax", 1)
+    assert "params/ is read, as by openpi, and not" in both.source.notes[0]
+
+
+def test_files_behind_links_are_part_of_a_trees_fingerprint(tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(GOLDEN / "pi05" / "jax", folder)
+    names = {file.name for file in open_checkpoint(folder, "pi05_libero").source.files}  # type: ignore[attr-defined]
+    (linked,) = (entry for entry in (folder / "params").iterdir() if entry.is_dir() and entry.name.startswith("ocdbt"))
+    linked.rename(tmp_path / "elsewhere")
+    linked.symlink_to(tmp_path / "elsewhere")
+    assert {file.name for file in open_checkpoint(folder, "pi05_libero").source.files} == names  # type: ignore[attr-defined]
+
+
+def test_an_index_that_belongs_to_other_shards_is_refused(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    (folder / "model.safetensors").rename(folder / "one.safetensors")
+    save_file({"time_mlp_in.bias": torch.ones(32)}, folder / "two.safetensors")
+    names = dict.fromkeys(load_file(folder / "one.safetensors"), "one.safetensors")
+    write_json(
+        folder / "model.safetensors.index.json", {"weight_map": names | {"action_in_proj.bias": "two.safetensors"}}
+    )
+    with pytest.raises(CheckpointError, match=r"lists action_in_proj.bias in two.safetensors, but the files hold some"):
+        open_checkpoint(folder)
+
+
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "model.", "module._orig_mod.", "policy.model."])
+@pytest.mark.parametrize("make", [torch_copy, lerobot_copy])
+def test_a_prefix_of_all_names_is_left_out_with_a_note(
+    tmp_path: Path, make: Callable[[Path], Path], prefix: str
+) -> None:
+    folder = make(tmp_path / "copy")
+    write_json(folder / "turbopi.json", {"vision_heads": 4} | ({"preset": "pi05_libero"} if make is torch_copy else {}))
+    fingerprint = open_checkpoint(folder).fingerprint()
+    tensors = load_file(folder / "model.safetensors")
+    save_file({prefix + name.removeprefix("model."): t.clone() for name, t in tensors.items()}, folder / "new")
+    (folder / "new").replace(folder / "model.safetensors")
+    opened = open_checkpoint(folder)
+    assert opened.fingerprint() == fingerprint
+    own = make is lerobot_copy and prefix == "model."
+    note = f"all names in model.safetensors begin with {prefix}: read without it"
+    assert (note in opened.source.notes) is not own
+
+
+def test_a_prefix_of_some_names_is_an_error_that_shows_them(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    tensors = load_file(folder / "model.safetensors")
+    save_file({f"module.{name}": t.clone() for name, t in tensors.items()} | {"step": torch.ones(1)}, folder / "new")
+    (folder / "new").replace(folder / "model.safetensors")
+    with pytest.raises(CheckpointError, match=r"first of each module: module.action_in_proj.bias, step$"):
+        open_checkpoint(folder)
+    ema = {f"{which}.{name}": t.clone() for name, t in tensors.items() for which in ("ema", "model")}
+    save_file(ema, folder / "new")
+    (folder / "new").replace(folder / "model.safetensors")
+    with pytest.raises(CheckpointError, match=r"ema.action_in_proj.bias, model.action_in_proj.bias"):
+        open_checkpoint(folder)
+
+
+@pytest.mark.parametrize("make", [torch_copy, lerobot_copy])
+def test_names_of_transformers_before_4_52_are_read(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+    folder = make(tmp_path / "copy")
+    write_json(folder / "turbopi.json", {"vision_heads": 4} | ({"preset": "pi05_libero"} if make is torch_copy else {}))
+    expected = open_checkpoint(folder)
+    fingerprint = expected.fingerprint()
+    old = {
+        P + "model.vision_tower.": P + "vision_tower.",
+        P + "model.multi_modal_projector.": P + "multi_modal_projector.",
+        P + "model.language_model.": P + "language_model.model.",
+        P + "lm_head.": P + "language_model.lm_head.",
+    }
+    tensors = {}
+    for name, tensor in load_file(folder / "model.safetensors").items():
+        for new, before in old.items():
+            name = name.replace(new, before)
+        tensors[name] = tensor
+    assert not any(P + "model." in name for name in tensors)
+    (folder / "model.safetensors").unlink()
+    save_file(tensors, folder / "model.safetensors")
+    opened = open_checkpoint(folder)
+    assert opened.fingerprint() == fingerprint
+    assert opened.source.notes == expected.source.notes
 
 
 @pytest.mark.parametrize("present", [TIED[:1], TIED[1:], TIED], ids=["lm_head", "embed_tokens", "both"])

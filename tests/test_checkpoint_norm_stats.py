@@ -10,6 +10,7 @@ from checkpoint_helpers import STATS
 
 from turbopi.checkpoint.norm_stats import (
     FeatureStats,
+    FoundStats,
     NormStats,
     asset_ids,
     dump_norm_stats,
@@ -18,7 +19,7 @@ from turbopi.checkpoint.norm_stats import (
     load_norm_stats,
 )
 from turbopi.config import Normalization
-from turbopi.errors import CheckpointError
+from turbopi.errors import CheckpointError, ConfigError
 
 
 @pytest.mark.parametrize("name", ["full", "aloha", "droid", "libero", "no_quantiles"])
@@ -165,18 +166,147 @@ def test_a_normalisation_without_its_statistics_is_refused() -> None:
         NormStats().check(Normalization("zscore", "zscore"), "here")
 
 
+QUANTILE = Normalization()
+
+
+def place(folder: Path, *places: str, mean: float = 0.0) -> list[Path]:
+    """Statistics at `<place>/norm_stats.json` below a folder, told apart by the state's mean."""
+    files = []
+    for where in places:
+        (folder / where).mkdir(parents=True, exist_ok=True)
+        files.append(folder / where / "norm_stats.json")
+        content = {"state": SOUND | {"mean": [mean, 1.0]}, "actions": SOUND}
+        files[-1].write_text(json.dumps({"norm_stats": content}))
+    return files
+
+
+def mean_of(found: FoundStats) -> float:
+    assert found.stats.state is not None and found.stats.state.mean is not None
+    return float(found.stats.state.mean[0])
+
+
 def test_missing_statistics_name_the_folder_and_are_never_an_identity(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=f"no {tmp_path}/assets/droid/norm_stats.json, and no other below"):
-        find_norm_stats(tmp_path / "assets", "droid", Normalization())
+        find_norm_stats(tmp_path, "droid", QUANTILE)
     with pytest.raises(CheckpointError, match=f"no {tmp_path}/assets/<asset id>/norm_stats.json"):
-        find_norm_stats(tmp_path / "assets", None, Normalization())
+        find_norm_stats(tmp_path, None, QUANTILE)
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets" / "droid").symlink_to("/nowhere")
+    with pytest.raises(CheckpointError, match=r"assets/droid is a link to /nowhere, which isn't there"):
+        find_norm_stats(tmp_path, "droid", QUANTILE)
 
 
 def test_identity_asked_for_needs_no_statistics(tmp_path: Path) -> None:
-    stats, _ = find_norm_stats(tmp_path / "assets", None, Normalization("identity", "identity"))
+    stats = find_norm_stats(tmp_path, None, Normalization("identity", "identity")).stats
     assert stats.state is None
     assert stats.actions is None
 
 
 def test_asset_ids_may_contain_a_slash(golden: Path) -> None:
     assert asset_ids(golden / "checkpoints" / "pi05" / "torch" / "assets") == ["physical-intelligence/libero"]
+
+
+@pytest.mark.parametrize("asset_id", ["my/arm", "my/arm/", "./my/arm", "my//arm", "other/../my/arm"])
+def test_the_path_that_an_asset_id_names_is_opened(tmp_path: Path, asset_id: str) -> None:
+    place(tmp_path, "assets/my/arm", mean=1.0)
+    place(tmp_path, "assets/other", mean=2.0)
+    found = find_norm_stats(tmp_path, asset_id, QUANTILE)
+    assert (mean_of(found), found.notes) == (1.0, ())
+
+
+def test_links_are_followed_as_openpi_follows_them(tmp_path: Path) -> None:
+    """To a folder, to the file, to all of assets/; a link back to a folder above ends the listing, not the program."""
+    folder = tmp_path / "ckpt"
+    place(tmp_path, "stats", mean=1.0)
+    (folder / "assets").mkdir(parents=True)
+    (folder / "assets" / "arm").symlink_to(tmp_path / "stats")
+    assert find_norm_stats(folder, "arm", QUANTILE).asset_id == "arm"
+    assert find_norm_stats(folder, None, QUANTILE).asset_id == "arm"
+    (folder / "assets" / "loop").symlink_to(folder)
+    assert [name for name in asset_ids(folder / "assets") if "loop" not in name] == ["arm"]
+    (folder / "assets" / "loop").unlink()
+    place(folder, "assets/other", mean=2.0)
+    with pytest.raises(ConfigError, match=r"has arm, other; choose with"):
+        find_norm_stats(folder, None, QUANTILE)
+    (tmp_path / "second").mkdir()
+    (tmp_path / "second" / "assets").symlink_to(folder / "assets")
+    assert mean_of(find_norm_stats(tmp_path / "second", "arm", QUANTILE)) == 1.0
+
+
+def test_copies_in_hidden_folders_are_no_assets(tmp_path: Path) -> None:
+    place(tmp_path, "assets/arm", mean=1.0)
+    place(tmp_path, "assets/.ipynb_checkpoints", "assets/arm/.ipynb_checkpoints", ".cache", mean=2.0)
+    found = find_norm_stats(tmp_path, None, QUANTILE)
+    assert (found.asset_id, mean_of(found), found.notes) == ("arm", 1.0, ())
+
+
+@pytest.mark.parametrize("asset_id", ["../..", "../../other", "/etc", "a/../../.."])
+def test_an_asset_id_never_leads_out_of_the_checkpoint(tmp_path: Path, asset_id: str) -> None:
+    place(tmp_path, ".", "other", "ckpt/assets/a")
+    with pytest.raises(CheckpointError, match=rf"asset_id is '{asset_id}', which leads out of"):
+        find_norm_stats(tmp_path / "ckpt", asset_id, QUANTILE)
+
+
+@pytest.mark.parametrize("where", ["my/arm", ".", "assets"])
+@pytest.mark.parametrize("asset_id", ["my/arm", None])
+def test_statistics_of_other_programs_places_are_found_and_said_to_be_there(
+    tmp_path: Path, where: str, asset_id: str | None
+) -> None:
+    (file,) = place(tmp_path, where, mean=1.0)
+    found = find_norm_stats(tmp_path, asset_id, QUANTILE)
+    assert mean_of(found) == 1.0
+    if where != "assets":
+        assert found.notes == (f"the statistics are those of {file}: openpi, which looks for them below assets/, "
+                               "wouldn't find them",)  # fmt: skip
+    assert found.asset_id == ("my/arm" if asset_id or where == "my/arm" else None)
+
+
+def test_where_openpi_looks_comes_first_and_others_that_differ_are_noted(tmp_path: Path) -> None:
+    place(tmp_path, "assets/arm", mean=1.0)
+    place(tmp_path, "arm", mean=1.0)
+    (other,) = place(tmp_path, ".", mean=2.0)
+    for asset_id in ("arm", None):
+        found = find_norm_stats(tmp_path, asset_id, QUANTILE)
+        assert mean_of(found) == 1.0
+        (note,) = found.notes  # the equal copy is none
+        assert note.startswith("two sources of statistics: ") and note.endswith(f"{other} has others")
+
+
+@pytest.mark.parametrize(
+    ("places", "asset_id"),
+    [
+        (("arm", "."), "arm"),
+        ((".", "assets"), "arm"),
+        ((".", "assets/other"), "arm"),  # whose are those without a name?
+        (("arm", "other"), None),
+        (("assets/arm", "assets/other"), None),
+    ],
+)
+def test_several_that_differ_are_an_error_that_names_all(
+    tmp_path: Path, places: tuple[str, ...], asset_id: str | None
+) -> None:
+    files = [place(tmp_path, where, mean=float(number))[0] for number, where in enumerate(places)]
+    with pytest.raises(ConfigError) as caught:
+        find_norm_stats(tmp_path, asset_id, QUANTILE)
+    for file in files:
+        name = file.parent.relative_to(tmp_path).as_posix().removeprefix("assets/")
+        assert str(file) in str(caught.value) or name in str(caught.value).split("; choose")[0]
+
+
+def test_statistics_of_another_asset_are_never_taken_for_the_named_one(tmp_path: Path) -> None:
+    place(tmp_path, "assets/other", "elsewhere")
+    with pytest.raises(CheckpointError, match=r"no .*assets/arm/norm_stats.json; there are statistics of other"):
+        find_norm_stats(tmp_path, "arm", QUANTILE)
+
+
+def test_a_row_of_statistics_is_broadcast_over_actions_and_refused_for_the_state(tmp_path: Path) -> None:
+    """As in openpi: x [H, n] * std [1, n] is [H, n], but a state of [1, n] doesn't fit its Observation."""
+    file, rows = tmp_path / "norm_stats.json", {name: [values] for name, values in SOUND.items()}
+    file.write_text(json.dumps({"norm_stats": {"state": SOUND, "actions": rows}}))
+    stats = load_norm_stats(file)
+    assert stats.actions is not None and stats.actions.q99 is not None
+    assert stats.actions.q99.tolist() == SOUND["q99"]
+    for broken in ({"state": rows, "actions": SOUND}, {"state": SOUND, "actions": rows | {"mean": [[0, 1], [0, 1]]}}):
+        file.write_text(json.dumps({"norm_stats": broken}))
+        with pytest.raises(CheckpointError, match="mean must be a list of finite numbers"):
+            load_norm_stats(file)

@@ -1,16 +1,28 @@
 """What isn't a checkpoint that Turbo-Pi reads, and checkpoints with something wrong: each says what, and what to do."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from checkpoint_helpers import GOLDEN, Tree, edit_tensors, jax_copy, read_tree, torch_copy, write_json, write_tree
+from checkpoint_helpers import (
+    GOLDEN,
+    LIBERO,
+    Tree,
+    edit_tensors,
+    jax_copy,
+    read_tree,
+    torch_copy,
+    write_json,
+    write_tree,
+)
 from safetensors.torch import load_file
 
 from turbopi.checkpoint import convert, open_checkpoint
-from turbopi.errors import CheckpointError
+from turbopi.errors import CheckpointError, ConfigError, TokenizerError
 from turbopi.model.reference import FloatPrecision
+from turbopi.preprocess.tokenizer import load_tokenizer
 
 V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 
@@ -90,6 +102,135 @@ def test_a_training_run_names_its_steps(tmp_path: Path) -> None:
     for step in ("10000", "29999", "5000"):
         (tmp_path / step / "params").mkdir(parents=True)
     with pytest.raises(CheckpointError, match=r"training steps \(5000, 10000, 29999\); give one .*, such as .*/29999"):
+        open_checkpoint(tmp_path)
+
+
+def test_an_interrupted_save_is_said_to_be_one_and_never_recommended(tmp_path: Path) -> None:
+    for name in ("tmp_1000", "500", "2000.orbax-checkpoint-tmp-17", "tmp-checkpoint-7", ".ipynb_checkpoints"):
+        (tmp_path / name / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"training steps \(500\); give .*/500 \(.*tmp_1000: what an interrupted"):
+        open_checkpoint(tmp_path)
+    shutil.rmtree(tmp_path / "500")
+    with pytest.raises(
+        CheckpointError, match=r"holds 2000.*, tmp-checkpoint-7, tmp_1000, what an interrupted save left"
+    ):
+        open_checkpoint(tmp_path)
+    step = tmp_path / "run" / "29999"
+    (step / "params.orbax-checkpoint-tmp-3").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"holds params.orbax-checkpoint-tmp-3, what an interrupted save left"):
+        open_checkpoint(step)
+    (tmp_path / "run" / "20000" / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"training steps \(20000\); give one of them, such as .*/20000$"):
+        open_checkpoint(tmp_path / "run")
+    assert any(
+        "tmp_9 is what an interrupted" in note for note in open_checkpoint(torch_copy(tmp_path / "tmp_9")).source.notes
+    )
+
+
+def test_lerobots_steps_are_recommended(tmp_path: Path) -> None:
+    for step in ("005000", "010000"):
+        folder = tmp_path / "checkpoints" / step / "pretrained_model"
+        folder.mkdir(parents=True)
+        (folder / "model.safetensors").touch()
+    with pytest.raises(CheckpointError, match=r"training steps \(005000, 010000\)"):
+        open_checkpoint(tmp_path / "checkpoints")
+
+
+def test_a_tree_one_folder_too_deep_is_named(tmp_path: Path) -> None:
+    (tmp_path / "params" / "params").mkdir(parents=True)
+    with pytest.raises(
+        CheckpointError, match=r"params/params lies one folder too deep: move what is in it to .*/params,"
+    ):
+        open_checkpoint(tmp_path)
+
+
+def test_a_download_that_is_not_finished_says_so(tmp_path: Path) -> None:
+    folder = tmp_path / "hub"
+    (folder / ".cache" / "huggingface" / "download").mkdir(parents=True)
+    (folder / ".cache" / "huggingface" / "download" / "model.safetensors.abc.incomplete").touch()
+    with pytest.raises(CheckpointError, match=r"isn't finished: there is \.cache/.*\.incomplete"):
+        open_checkpoint(folder)
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "model.safetensors").symlink_to("../../blobs/0123")
+    with pytest.raises(
+        CheckpointError, match=r"model.safetensors is a link to \.\./\.\./blobs/0123, which isn't there"
+    ):
+        open_checkpoint(tmp_path / "linked")
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards" / "model-00001-of-00002.safetensors").touch()
+    with pytest.raises(CheckpointError, match=r"holds model-00001-of-00002.safetensors, but neither .*index.json"):
+        open_checkpoint(tmp_path / "shards")
+    write_json(tmp_path / "shards" / "model.safetensors.index.json", {"weight_map": {"a": "b.safetensors"}})
+    with pytest.raises(CheckpointError, match=r"aren't there: b.safetensors; .* none of its files are there"):
+        open_checkpoint(tmp_path / "shards")
+    (tmp_path / "save" / "params" / "ocdbt.process_0").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"has ocdbt.process_0, but no manifest.ocdbt, which Orbax writes last"):
+        open_checkpoint(tmp_path / "save", "pi05_libero")
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 14470000\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (POINTER, "is a Git-LFS pointer, not the file itself: `git lfs pull`"),
+        (b"<!DOCTYPE html><html></html>", "is a web page, not the file itself"),
+        (bytes(1000), "begins with zeros: a download set its space aside"),
+    ],
+)
+def test_what_a_download_left_instead_of_a_file_is_named(tmp_path: Path, content: bytes, what: str) -> None:
+    for name in ("model.safetensors", "config.json", "turbopi.json", f"assets/{LIBERO}/norm_stats.json"):
+        folder = torch_copy(tmp_path / name.replace("/", "-"))
+        (folder / name).unlink()
+        (folder / name).write_bytes(content)
+        with pytest.raises((CheckpointError, ConfigError), match=f"{name} {what}"):
+            open_checkpoint(folder)
+    (tmp_path / "tokenizer.model").write_bytes(content)
+    with pytest.raises(TokenizerError, match=what):
+        load_tokenizer(tmp_path / "tokenizer.model", vocab_size=10)
+    folder = tmp_path / "jax"
+    shutil.copytree(GOLDEN / "pi05" / "jax", folder)
+    largest = max((folder / "params").rglob("*"), key=lambda file: file.stat().st_size)
+    largest.write_bytes(content)
+    with pytest.raises(CheckpointError, match=f"{largest.name} {what}"):
+        open_checkpoint(folder, "pi05_libero").load("cpu", "f32")
+
+
+def test_half_of_a_file_as_zeros_is_refused_and_one_layer_is_a_note(tmp_path: Path) -> None:
+    """Scales of norms (stored less 1), adaRMS layers and biases may be zero."""
+    folder = torch_copy(tmp_path / "c")
+    whole = load_file(folder / "model.safetensors")
+    may_be = {name: torch.zeros_like(t) for name, t in whole.items() if "norm" in name or t.ndim < 2}
+    edit_tensors(folder, **may_be)
+    assert open_checkpoint(folder).source.notes == []
+    layer = "paligemma_with_expert.gemma_expert.model.layers.1.mlp.down_proj.weight"
+    row = torch.zeros_like(whole[layer])
+    row[0, 0] = 1  # not all of it
+    edit_tensors(folder, **{layer: row})
+    assert open_checkpoint(folder).source.notes == []
+    edit_tensors(folder, **{layer: torch.zeros_like(row)})
+    (note,) = open_checkpoint(folder).source.notes
+    assert note.startswith("1 of the model's ") and note.endswith(f"hold nothing but zeros: {layer}")
+    half = sorted(whole)[len(whole) // 2 :]
+    edit_tensors(folder, **{name: torch.zeros_like(whole[name]) for name in half})
+    with pytest.raises(CheckpointError, match=r"hold nothing but zeros: .* and \d+ more .*The file is there in part"):
+        open_checkpoint(folder)
+
+
+def test_a_trainers_own_files_are_not_taken_for_weights(tmp_path: Path) -> None:
+    for name in ("optimizer.pt", "metadata.pt", "rng_state.pth", "training_args.bin"):
+        (tmp_path / name).touch()
+    with pytest.raises(CheckpointError, match=r"holds no checkpoint: expected model.safetensors"):
+        open_checkpoint(tmp_path)
+    below = tmp_path / "actor" / "model_state_dict"
+    below.mkdir(parents=True)
+    (below / "full_weights.pt").touch()
+    with pytest.raises(CheckpointError, match=r"but actor/model_state_dict/full_weights.pt: pickled weights can run.*"
+                       r"save_file\(torch.load\(\".*full_weights.pt\", weights_only=True\)"):  # fmt: skip
+        open_checkpoint(tmp_path)
+    (below / "full_weights.pt").rename(below / "__0_0.distcp")
+    with pytest.raises(CheckpointError, match=r"dcp_to_torch .*model_state_dict whole.pt"):
         open_checkpoint(tmp_path)
 
 
@@ -218,6 +359,7 @@ def test_truncated_files_ask_whether_the_download_is_complete(tmp_path: Path) ->
 
 def test_a_broken_shard_index_is_refused(tmp_path: Path) -> None:
     folder = torch_copy(tmp_path / "c")
+    (folder / "model.safetensors").unlink()
     write_json(folder / "model.safetensors.index.json", {"weights": {}})
     with pytest.raises(CheckpointError, match="isn't a safetensors index"):
         open_checkpoint(folder)

@@ -3,6 +3,7 @@
 import json
 import logging
 import runpy
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,19 @@ def test_places_are_searched_in_order(tmp_path: Path, no_cache: Path) -> None:
     assert load_tokenizer(checkpoint, vocab_size=TINY_VOCAB).source == str(checkpoint / "tokenizer.model")
 
 
+def test_two_tokenizers_of_a_checkpoint_that_differ_are_warned_of(
+    tmp_path: Path, no_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "assets").mkdir()
+    for file in (tmp_path / "tokenizer.model", tmp_path / "assets" / "tokenizer.model"):
+        shutil.copyfile(TINY_TOKENIZER, file)
+    load_tokenizer(checkpoint_dir=tmp_path, vocab_size=TINY_VOCAB)
+    assert "two sources" not in caplog.text
+    file.write_bytes(b"another")
+    assert load_tokenizer(checkpoint_dir=tmp_path, vocab_size=TINY_VOCAB).source == str(tmp_path / "tokenizer.model")
+    assert f"{tmp_path / 'tokenizer.model'} is read, and {file} differs" in caplog.text
+
+
 def test_without_a_tokenizer_the_error_says_where_to_get_it(tmp_path: Path, no_cache: Path) -> None:
     with pytest.raises(TokenizerError) as caught:
         load_tokenizer(checkpoint_dir=tmp_path, vocab_size=257_152)
@@ -159,7 +173,9 @@ def test_a_given_path_is_the_only_place(tmp_path: Path, no_cache: Path) -> None:
 def test_files_of_something_else_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "tokenizer.model"
     path.write_bytes(content)
-    with pytest.raises(TokenizerError, match=r"tokenizer\.model isn't a (readable )?SentencePiece model"):
+    with pytest.raises(
+        TokenizerError, match=r"tokenizer\.model (isn't a (readable )?SentencePiece model|begins with zeros)"
+    ):
         load_tokenizer(path, vocab_size=TINY_VOCAB)
 
 

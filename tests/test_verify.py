@@ -1,5 +1,6 @@
 """The certificate: what is right passes, each planted fault fails by its name, and the document is complete."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -14,6 +15,7 @@ from cli_helpers import refusal, turbopi
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import CheckpointError
+from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
@@ -21,11 +23,13 @@ from turbopi.reading import as_document, plain_document, read_document
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
 from turbopi.studies import certificates
-from turbopi.verify.document import Certificate
+from turbopi.verify.check_golden import _compare_rounded, check_case
+from turbopi.verify.document import Certificate, Judged
+from turbopi.verify.golden import GoldenFolder, Run
 from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.verify.run import verify
-from turbopi.verify.verdict import ACTIONS, Rule
+from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 STEPS = 2
 WEIGHTS = ("--random-weights", "pi05_tiny")
@@ -204,6 +208,81 @@ def test_weights_whose_reference_is_not_finite_are_refused(monkeypatch: pytest.M
     monkeypatch.setattr(Pi0Model, "encode_prefix", overflowing)
     with pytest.raises(CheckpointError, match=r"itself gives values that aren't finite: kv_v layer 1, on LIBERO frame"):
         verify(random_checkpoint("pi05_tiny"), quick_plan())
+
+
+# Nothing to judge
+
+
+def judged(noise: np.ndarray, exact: np.ndarray, ours: np.ndarray, of_control: np.ndarray, **rule: Any) -> Judged:
+    """The verdict on one call, by the actions float32[H, d] of reference, backend and control."""
+    inputs = ModelInputs(np.zeros(1), np.ones(1, bool), np.zeros(1), np.ones(1, bool), np.zeros(1))
+    call = NoisyExample(0, Example("one", inputs, np.zeros(8)), 0, torch.from_numpy(noise[None]), first=True)
+    compared, control = Compared(), Compared()
+    for which, actions in ((compared, ours), (control, of_control)):
+        which.add(call, {ACTIONS: actions}, {ACTIONS: exact}, actions, exact)
+    return judge(Rule.of("fused", "bf16", **rule), "bf16", "plain", compared, control, Repetition())
+
+
+NOISE = np.random.default_rng(0).standard_normal((10, 32)).astype(np.float32)
+BIAS = np.linspace(-3, 3, 32, dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    "exact",
+    [
+        np.zeros_like(NOISE),
+        np.ones_like(NOISE),
+        NOISE,  # denoising did nothing
+        sum([BIAS / 10] * 10, NOISE),  # or the same whatever the observation
+        NOISE + np.nan,
+    ],
+    ids=["zero", "constant", "untouched", "constant_velocity", "nan"],
+)
+@pytest.mark.parametrize("bound", [{}, {"bound": 1.0}])
+def test_a_reference_without_a_signal_passes_nothing(exact: np.ndarray, bound: dict[str, float]) -> None:
+    document = judged(NOISE, exact, exact, exact, **bound)
+    assert not document.ok
+    assert document.verdict.startswith("FAIL: nothing to judge: the float32 reference's actions")
+
+
+def test_a_control_that_gives_no_bound_passes_nothing() -> None:
+    exact = (NOISE * 0.1).astype(np.float32)
+    rounded = exact + np.float32(1e-3) * NOISE[::-1]
+    assert judged(NOISE, exact, rounded, rounded).ok
+    same = judged(NOISE, exact, exact, exact)
+    assert not same.ok and "nothing to judge: the control has no error" in same.verdict
+    infinite = judged(NOISE, exact, rounded, exact + np.inf)
+    assert not infinite.ok and "nothing to judge: the control's actions aren't finite" in infinite.verdict
+    assert judged(NOISE, exact, exact, exact + np.inf, bound=1e-5).ok  # a bound of its own needs no control
+
+
+def test_weights_that_do_nothing_fail_as_nothing_to_judge(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(model: Pi0Model, *args: Any, **options: Any) -> torch.Tensor:
+        for parameter in model.action_out_proj.parameters():
+            parameter.data.zero_()
+        return original(model, *args, **options)
+
+    original = Pi0Model.denoise
+    monkeypatch.setattr(Pi0Model, "denoise", nothing)
+    document = verify(random_checkpoint("pi05_tiny"), quick_plan())
+    assert not document.ok
+    assert document.verdict.startswith("FAIL: nothing to judge: ")
+    assert document.checks[0].name == "signal"
+
+
+def test_a_golden_case_without_a_signal_is_refused(golden: Path) -> None:
+    case = next(iter(GoldenFolder(golden).cases()))
+    empty = {name: {"actions": case.noise.numpy()} for name in ("torch_fp32", "torch_bf16")}
+    with pytest.raises(CheckpointError, match=f"{case.name}, torch_fp32, 3 steps: nothing to judge"):
+        check_case(dataclasses.replace(case, runs=[Run(3, empty)]), tiny_policy().backend)
+
+
+def test_a_golden_bf16_run_that_is_not_finite_is_no_bound(golden: Path) -> None:
+    case = next(iter(GoldenFolder(golden).cases()))
+    exact, ours = case.noise.numpy() * 0.5, case.noise.numpy() * 0.4
+    variants = {"torch_fp32": {"actions": exact}, "torch_bf16": {"actions": exact + np.inf}}
+    (compared,) = _compare_rounded(case, Run(3, variants), {"actions": ours}, "bf16")
+    assert compared.ok is False
 
 
 # Bounds, observations, refusals

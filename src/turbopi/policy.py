@@ -117,7 +117,8 @@ class UnifiedPolicy:
             vocab_size=checkpoint.config.model.vocab_size,
         )
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
-        for note in self._pipeline.notes:
+        of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes
+        for note in (*of_weights, *self._pipeline.notes):
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
 

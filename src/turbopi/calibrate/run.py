@@ -23,7 +23,7 @@ from turbopi.calibrate.product_errors import product_errors
 from turbopi.calibrate.report import read_report
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
-from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
+from turbopi.engine.emulate import NO_SIGNAL, RoundedWeights, delta_cosine, has_signal, relative_rms, rounded
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import CheckpointError
 from turbopi.examples import NoisyExample, with_noises
@@ -253,6 +253,9 @@ class _Trials:
             progress.advance()
             if not bool(self.exact[-1].isfinite().all()):
                 raise CheckpointError("the float32 reference itself gives actions that aren't finite; damaged weights?")
+        noise = torch.cat([noise for _, (_, noise) in self._made])
+        if not has_signal(torch.cat(self.exact).cpu().numpy(), noise.cpu().numpy()):
+            raise CheckpointError(f"nothing to judge: {NO_SIGNAL}")
 
     @property
     def format(self) -> Format:

@@ -206,7 +206,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         if values[name] is None and getattr(PRESETS[preset], name) is None:
             del values[name]
     parsed = Settings(SETTINGS, values=parse_values(json.loads(json.dumps(values)), SETTINGS))
-    back = policy_config(parsed, config.model.kind, horizon=None, assets=[], where=Path(SETTINGS))
+    back = policy_config(parsed, config.model.kind, assets=[], where=Path(SETTINGS))
     lost = [
         f"{owner}.{item.name}"
         for owner, ours, theirs in (

@@ -1,4 +1,4 @@
-"""Finding out what a path holds, and telling users what to do about what Turbo-Pi can't read."""
+"""Finding out what a path holds; `nothing_here` says what to do about a folder without weights to read."""
 
 import re
 from contextlib import suppress
@@ -7,19 +7,16 @@ from pathlib import Path
 from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
+from turbopi.checkpoint.nothing_here import INTERRUPTED, PRETRAINED, holds_weights, nothing_here, unfinished_save
 from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
-from turbopi.checkpoint.source import listing
-from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
-from turbopi.config import LIMITS
+from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
 from turbopi.errors import CheckpointError
 from turbopi.files import openpi_cache
-from turbopi.reading import Fields, read_json
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
-PRECISIONS = ("bfloat16", "float32", "float16")  # of openpi's converter
 
 _DOWNLOAD = {
     "gs": "gsutil -m cp -r {address} DIR (or openpi's own openpi.shared.download)",
@@ -38,10 +35,7 @@ class Location:
     folder: Path  # what holds assets/, config.json and turbopi.json
     weights: Path  # the folder of the safetensors files, or of the Orbax tree
     adapter: bool = False  # the weights are an adapter of the peft library
-
-    @property
-    def assets(self) -> Path:
-        return self.folder / "assets"
+    notes: tuple[str, ...] = ()  # on other weights in the folder, which aren't read
 
 
 def locate(path: str | Path) -> Location:
@@ -53,47 +47,26 @@ def locate(path: str | Path) -> Location:
     if (folder / MANIFEST).is_file():  # openpi's params/ itself
         named = folder if folder.name == "params" else folder.resolve()  # "." and links have other names
         return Location("openpi_jax", named.parent if named.name == "params" else folder, folder)
-    if (folder / "pretrained_model").is_dir():  # one step of LeRobot's training output
-        folder = folder / "pretrained_model"
-    if is_lerobot(folder) and is_adapter(folder):
-        return Location("lerobot", folder, folder, adapter=True)
+    if not holds_weights(folder) and (folder / PRETRAINED).is_dir():  # one step of LeRobot's training output
+        folder = folder / PRETRAINED
+    if (folder / ADAPTER).is_file() and is_lerobot(folder) and is_adapter(folder):
+        return Location("lerobot", folder, folder, adapter=True, notes=_notes(folder, "lerobot", adapter=True))
     if (folder / ONNX_MANIFEST).is_file():
-        return Location("onnx", folder, folder)
-    _refuse_other_formats(folder)
-    if _has_safetensors(folder):  # before params/, as openpi does
-        return Location("lerobot" if is_lerobot(folder) else "openpi_torch", folder, folder)
-    if (folder / "params").is_dir():
-        return Location("openpi_jax", folder, folder / "params")
-    raise CheckpointError(_nothing_here(folder))
+        return Location("onnx", folder, folder, notes=_notes(folder, "onnx"))
+    params = folder / "params"
+    if (folder / WEIGHTS).is_file() or ((folder / INDEX).is_file() and not params.is_dir()):  # openpi's own order
+        form: CheckpointFormat = "lerobot" if is_lerobot(folder) else "openpi_torch"
+        return Location(form, folder, folder, notes=_notes(folder, form))
+    if params.is_dir() and ((params / MANIFEST).is_file() or not (params / "params").is_dir()):
+        return Location("openpi_jax", folder, params, notes=_notes(folder, "openpi_jax"))
+    raise CheckpointError(nothing_here(folder))
 
 
 def tokenizer_candidates(folder: Path) -> list[Path]:
-    """SentencePiece models in or below a checkpoint's folder (params/ and hidden folders aside), nearest first."""
+    """SentencePiece models in or below a checkpoint's folder (params/ and hidden ones aside), nearest first."""
     patterns = ("*.model", "assets/*.model", "tokenizer/*.model", "big_vision/*.model")
-    return [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What the config.json says that openpi's converter writes, where it has it."""
-
-    numbers: dict[str, int]  # action_dim, action_horizon
-    variants: dict[str, str]  # paligemma_variant, action_expert_variant: openpi's names of sizes, or a fork's
-
-
-def recorded_config(location: Location) -> Recorded:
-    """openpi's config.json. CheckpointError for values that no converter writes; openpi itself reads none of them."""
-    file = location.folder / "config.json"
-    if location.format != "openpi_torch" or not file.is_file():
-        return Recorded({}, {})
-    content = read_json(file)
-    fields = Fields({key: value for key, value in content.items() if value is not None}, file)
-    fields.choice("precision", PRECISIONS, default=PRECISIONS[0])
-    sizes = [key for key in ("action_dim", "action_horizon") if key in fields.values]
-    variants = [key for key in ("paligemma_variant", "action_expert_variant") if key in fields.values]
-    return Recorded(
-        {key: fields.integer(key, 1, LIMITS[key]) for key in sizes}, {key: fields.text(key) for key in variants}
-    )
+    found = [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
+    return [file for file in found if not file.name.startswith(".")]
 
 
 def _local(path: str | Path) -> Path:
@@ -116,60 +89,25 @@ def _local(path: str | Path) -> Path:
     raise CheckpointError(f"there is no folder {folder}{hint}")
 
 
-def _has_safetensors(folder: Path) -> bool:
-    return (folder / WEIGHTS).is_file() or (folder / INDEX).is_file()
+def _notes(folder: Path, read: CheckpointFormat, *, adapter: bool = False) -> tuple[str, ...]:
+    """Notes on the folder and on other weights in it: which the format's owner doesn't read, nor do we."""
+    whole, index, params = folder / WEIGHTS, folder / INDEX, folder / "params"
+    others = {
+        params: read != "openpi_jax" and params.is_dir(),
+        whole: (read == "onnx" or adapter) and whole.is_file(),
+        index: index.is_file() and (read == "openpi_jax" or (whole.is_file() and not _is_of(index, whole))),
+    }
+    used = "the graphs" if read == "onnx" else "the adapter and its base" if adapter else whole.name
+    used = "params/" if read == "openpi_jax" else used
+    owner = {"openpi_jax": "openpi", "openpi_torch": "openpi", "lerobot": "LeRobot"}.get(read)
+    as_owner = f", as by {owner}" if owner else ""
+    verb = "are" if used.startswith("the ") else "is"
+    notes = [f"two sources of weights: {used} {verb} read{as_owner}, and not {file}" for file in others if others[file]]
+    return (*notes, *([f"{folder.name} is {INTERRUPTED}"] if unfinished_save(folder.name) else []))
 
 
-def _refuse_other_formats(folder: Path) -> None:
-    if (folder / ADAPTER).is_file() and not _has_safetensors(folder):
-        raise CheckpointError(
-            f"{folder} holds adapters of the peft library without LeRobot's config.json and processors, which describe "
-            "the policy. Put them there, or merge the adapters (peft's merge_and_unload), save the whole model, and "
-            "give that folder"
-        )
-    pickled = [file.name for suffix in ("bin", "pt", "pth", "ckpt") for file in sorted(folder.glob(f"*.{suffix}"))]
-    if pickled and not _has_safetensors(folder) and not (folder / "params").is_dir():
-        raise CheckpointError(
-            f"{folder} holds {listing(pickled)}: pickled weights can run code when loaded and aren't read. Save them "
-            f"as {WEIGHTS} (safetensors.torch.save_model)"
-        )
-
-
-def _steps(folder: Path) -> list[Path]:
-    """The steps of a training run in a folder, the last one at the end; none if it can't be read."""
-    with suppress(OSError):
-        return sorted((e for e in folder.iterdir() if e.name.isdigit() and e.is_dir()), key=lambda e: int(e.name))
-    return []
-
-
-def _checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints right in a folder; none if it can't be read."""
-    with suppress(OSError):
-        return sorted(entry for entry in folder.iterdir() if _holds_weights(entry))
-    return []
-
-
-def _holds_weights(folder: Path) -> bool:
-    with suppress(OSError):
-        return _has_safetensors(folder) or (folder / "params").is_dir()
+def _is_of(index: Path, whole: Path) -> bool:
+    """Whether an index lists that one file alone."""
+    with suppress(CheckpointError):
+        return set(read_index(index).values()) == {whole.name}
     return False
-
-
-def _nothing_here(folder: Path) -> str:
-    if steps := _steps(folder):
-        names = ", ".join(step.name for step in steps)
-        return f"{folder} holds training steps ({names}); give one of them, such as {steps[-1]}"
-    if below := _checkpoints(folder):
-        names = listing([entry.name for entry in below])
-        return f"{folder} holds no checkpoint, but folders that do ({names}); give one of them, such as {below[0]}"
-    for entry in sorted(entry for entry in folder.iterdir() if entry.is_dir()):
-        if deeper := _steps(entry)[-1:] or _checkpoints(entry):
-            return f"{folder} holds no checkpoint, but there are some further below; give one, such as {deeper[0]}"
-    for above in folder.resolve().parents[:2]:  # of assets/, or of an asset's folder
-        if _holds_weights(above):
-            return f"{folder} holds no checkpoint, but the folder above does; give {above}"
-    entries = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in folder.iterdir())
-    return (
-        f"{folder} holds no checkpoint: expected {WEIGHTS} (openpi's PyTorch, LeRobot) or params/ (openpi's JAX), "
-        f"but it has {listing(entries) if entries else 'nothing'}"
-    )

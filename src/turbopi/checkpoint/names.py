@@ -1,7 +1,10 @@
 """Parameter names: Turbo-Pi's canonical ones and those of openpi's PyTorch files.
 
-Canonical names (see `model/reference.py`) are openpi's with shorter prefixes. LeRobot's are openpi's behind `model.`.
+Canonical names (see `model/reference.py`) are openpi's with shorter prefixes. LeRobot's are openpi's behind `model.`,
+other programs' behind what they wrap a model in (`module.`, `_orig_mod.`).
 """
+
+from collections.abc import Collection
 
 _PALIGEMMA = "paligemma_with_expert.paligemma."
 _VISION = _PALIGEMMA + "model.vision_tower.vision_model."
@@ -24,6 +27,31 @@ _PREFIXES = (  # canonical, openpi; the first that fits
 )
 
 
+_BEFORE_4_52 = (  # of Transformers, below paligemma.: its names until then, openpi's
+    ("vision_tower.", "model.vision_tower."),
+    ("multi_modal_projector.", "model.multi_modal_projector."),
+    ("language_model.model.", "model.language_model."),
+    ("language_model.lm_head.", "lm_head."),
+)
+_LANDMARK = "action_in_proj.weight"  # in every Pi0 and Pi0.5, below no other module
+
+
+def common_prefix(keys: Collection[str]) -> str:
+    """What a wrapper put before openpi's names, such as "module._orig_mod."; "" unless it is before every one."""
+    found = {key.removesuffix(_LANDMARK) for key in keys if f".{key}".endswith(f".{_LANDMARK}")}
+    prefix = found.pop() if len(found) == 1 else ""
+    return prefix if all(key.startswith(prefix) for key in keys) else ""
+
+
+def current_name(name: str) -> str:
+    """The name that openpi has for a tensor which Transformers named otherwise before 4.52."""
+    below = name.removeprefix(_PALIGEMMA)
+    for old, new in _BEFORE_4_52 if below != name else ():
+        if below.startswith(old):
+            return _PALIGEMMA + new + below[len(old) :]
+    return name
+
+
 def to_openpi(name: str) -> str:
     """The name of a canonical parameter in openpi's `model.safetensors`."""
     for ours, theirs in _PREFIXES:
@@ -35,8 +63,9 @@ def to_openpi(name: str) -> str:
 def from_openpi(name: str) -> str:
     """The canonical name of a tensor in openpi's `model.safetensors`; unknown names come back unchanged.
 
-    Newer `transformers` releases drop the level `vision_model`: both spellings are read.
+    Newer `transformers` releases drop the level `vision_model`, older ones have others: all spellings are read.
     """
+    name = current_name(name)
     short = _VISION.removesuffix("vision_model.")
     if name.startswith(short) and not name.startswith(_VISION):
         name = _VISION + name[len(short) :]

@@ -1,16 +1,18 @@
 """Normalisation statistics: openpi's `norm_stats.json`, and LeRobot's tensors."""
 
+import filecmp
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from posixpath import normpath
 
 import numpy as np
 
 from turbopi.checkpoint.source import listing
 from turbopi.config import Normalization, NormMode
 from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import is_finite, read_json, shown
+from turbopi.reading import files_below, is_finite, read_json, shown
 
 FILE_NAME = "norm_stats.json"
 STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
@@ -129,7 +131,11 @@ def feature_stats(values: Mapping[str, object], where: str) -> FeatureStats:
 
 
 def load_norm_stats(file: str | Path) -> NormStats:
-    """Read openpi's `norm_stats.json`. Quantiles may be null (Pi0's files). CheckpointError if it isn't one."""
+    """Read openpi's `norm_stats.json`. Quantiles may be null (Pi0's files). CheckpointError if it isn't one.
+
+    Statistics of actions may have shape [1, n]: openpi broadcasts them over the chunk [H, n]. Those of the state must
+    be [n]: of others openpi makes a state of two axes, which its `Observation` refuses.
+    """
     file = Path(file)
     stats = read_json(file).get("norm_stats")
     if not isinstance(stats, dict) or not all(isinstance(entry, dict) for entry in stats.values()):
@@ -137,7 +143,14 @@ def load_norm_stats(file: str | Path) -> NormStats:
     if set(stats) != {"state", "actions"}:
         found = listing(sorted(stats)) or "nothing"
         raise CheckpointError(f"{file} has statistics of {found}; expected state and actions")
-    return NormStats(**{name: feature_stats(entry, f"{file}: {name}") for name, entry in stats.items()})
+    actions = {name: values[0] if _is_row(values) else values for name, values in stats["actions"].items()}
+    return NormStats(
+        **{name: feature_stats(entry, f"{file}: {name}") for name, entry in (stats | {"actions": actions}).items()}
+    )
+
+
+def _is_row(values: object) -> bool:
+    return isinstance(values, list) and len(values) == 1 and isinstance(values[0], list)
 
 
 def dump_norm_stats(stats: NormStats) -> str:
@@ -152,42 +165,126 @@ def dump_norm_stats(stats: NormStats) -> str:
     return json.dumps({"norm_stats": content}, indent=2)
 
 
+# -- where they are ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FoundStats:
+    """A checkpoint's statistics."""
+
+    stats: NormStats
+    asset_id: str | None = None  # None: of no asset
+    notes: tuple[str, ...] = ()  # where they are, if openpi wouldn't find them; others that differ
+
+
 def asset_ids(assets: Path) -> list[str]:
     """The folders below `assets` that hold statistics, as openpi names them (they may contain a /)."""
-    if not assets.is_dir():
-        return []
-    return sorted(file.parent.relative_to(assets).as_posix() for file in assets.rglob(FILE_NAME))
+    return sorted(file.parent.relative_to(assets).as_posix() for file in _below(assets))
 
 
-def find_norm_stats(assets: Path, asset_id: str | None, normalization: Normalization) -> tuple[NormStats, str | None]:
-    """The statistics of an openpi checkpoint and the asset id they come from.
+def find_norm_stats(folder: Path, asset_id: str | None, normalization: Normalization) -> FoundStats:
+    """The statistics of the openpi checkpoint in `folder`.
 
-    Raises CheckpointError if they are missing, naming the folder and what it holds, and ConfigError if asset_id is None
-    and there are several.
+    Of an asset id that is given, assets/<asset id>/norm_stats.json is opened, as openpi does, whatever a listing shows.
+    Where that isn't there: what other programs leave in <asset id>/, assets/ or the folder itself, with a note.
+
+    Raises CheckpointError if they are missing, naming the folder and what it holds, and ConfigError that names all of
+    them if there are several to choose from.
     """
     if not NEEDS[normalization.state] and not NEEDS[normalization.actions]:
-        return NormStats(), asset_id
-    found = asset_ids(assets)
-    if asset_id is None and len(found) > 1:
-        raise ConfigError(f'{assets} has {", ".join(found)}; choose with {{"asset_id": ...}} in turbopi.json')
-    if asset_id is None and found:
-        asset_id = found[0]
-    if asset_id not in found:
-        raise CheckpointError(_missing(assets, asset_id, found))
-    file = assets / str(asset_id) / FILE_NAME
+        return FoundStats(NormStats(), asset_id)
+    file, asset_id = _only(folder) if asset_id is None else _of_asset(folder, asset_id)
     stats = load_norm_stats(file)
     stats.check(normalization, file)
-    return stats, asset_id
+    return FoundStats(stats, asset_id, tuple(_notes(folder, file, asset_id)))
 
 
-def _missing(assets: Path, asset_id: str | None, found: Sequence[str]) -> str:
+def _below(folder: Path) -> list[Path]:
+    """norm_stats.json in a folder and below it. Hidden folders, such as .ipynb_checkpoints, hold copies."""
+    return [file for file in files_below(folder, depth=5) if file.name == FILE_NAME]
+
+
+def _only(folder: Path) -> tuple[Path, str | None]:
+    """The only statistics there are: below assets/, or else anywhere in the checkpoint."""
+    places = _below(folder / "assets") or _below(folder)
+    if len(places) > 1:
+        raise ConfigError(_ambiguous(folder, places))
+    if not places:
+        raise CheckpointError(_missing(folder, None))
+    (file,) = places
+    return file, _name(file.parent.relative_to(folder).as_posix().removeprefix("assets").removeprefix("/"))
+
+
+def _of_asset(folder: Path, asset_id: str) -> tuple[Path, str | None]:
+    """The statistics of an asset; a path that leads out of the checkpoint isn't opened."""
+    if asset_id.startswith("/") or _leads_out(f"assets/{asset_id}"):
+        raise CheckpointError(
+            f"asset_id is {shown(asset_id)}, which leads out of {folder}; expected a folder below assets/"
+        )
+    own = folder / "assets" / asset_id / FILE_NAME
+    if own.is_file():
+        return own, _name(asset_id)
+    named, unnamed = _elsewhere(folder, asset_id)
+    # without a name in their path they may be those of any asset that is there
+    places = [*named, *unnamed, *([] if named or not unnamed else _below(folder))]
+    if not places:
+        raise CheckpointError(_missing(folder, asset_id))
+    if not _all_alike(places):
+        raise ConfigError(f"no {own}; " + _ambiguous(folder, list(dict.fromkeys(places))))
+    return places[0], _name(asset_id)
+
+
+def _elsewhere(folder: Path, asset_id: str | None) -> tuple[list[Path], list[Path]]:
+    """What other programs leave: statistics (under the asset's name, without a name)."""
+    named = [] if asset_id is None or _leads_out(asset_id) else [folder / asset_id / FILE_NAME]
+    unnamed = [folder / "assets" / FILE_NAME, folder / FILE_NAME]
+    return [file for file in named if file.is_file()], [file for file in unnamed if file.is_file()]
+
+
+def _leads_out(path: str) -> bool:
+    return normpath(path).split("/")[0] == ".."
+
+
+def _notes(folder: Path, file: Path, asset_id: str | None) -> Iterator[str]:
+    if folder / "assets" not in file.parents:
+        yield f"the statistics are those of {file}: openpi, which looks for them below assets/, wouldn't find them"
+    named, unnamed = _elsewhere(folder, asset_id)
+    for other in dict.fromkeys([*named, *unnamed]):
+        if not _all_alike([file, other]):
+            yield f"two sources of statistics: those of {file} are used, and {other} has others"
+
+
+def _all_alike(files: Sequence[Path]) -> bool:
+    return all(filecmp.cmp(files[0], file, shallow=False) for file in files[1:])
+
+
+def _name(asset_id: str) -> str | None:
+    """An asset id without what leads to it; None if that is all it is."""
+    return "/".join(part for part in asset_id.split("/") if part not in ("", ".", "..")) or None
+
+
+def _ambiguous(folder: Path, places: Sequence[Path]) -> str:
+    """Names all of them by what `asset_id` would be."""
+    assets = folder / "assets"
+    in_assets = all(assets in file.parents for file in places)
+    names = [file.parent.relative_to(assets if assets in file.parents else folder).as_posix() for file in places]
+    where = "" if in_assets else f" (statistics in {', '.join(map(str, places))})"
+    owner = assets if in_assets else folder
+    return f'{owner} has {", ".join(names)}; choose with {{"asset_id": ...}} in turbopi.json{where}'
+
+
+def _missing(folder: Path, asset_id: str | None) -> str:
+    assets = folder / "assets"
     wanted = assets / (asset_id or "<asset id>") / FILE_NAME
-    if found:
+    for link in (wanted, *wanted.parents):
+        if link.is_symlink() and not link.exists():
+            return f"norm stats are missing: {link} is a link to {link.readlink()}, which isn't there"
+    if found := asset_ids(assets) or asset_ids(folder):
         return (
             f"norm stats are missing: no {wanted}; there are statistics of {', '.join(found)}. If one of them is "
             'right, choose it with {"asset_id": ...} in turbopi.json beside the weights'
         )
     return (
-        f"norm stats are missing: no {wanted}, and no other below {assets}. openpi saves them there when it trains; "
+        f"norm stats are missing: no {wanted}, and no other below {folder}. openpi saves them there when it trains; "
         "copy the folder assets/ of the training checkpoint. Without them actions would have the wrong scale"
     )

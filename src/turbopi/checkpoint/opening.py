@@ -5,18 +5,19 @@ from pathlib import Path
 from typing import Any
 
 from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
+from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
 from turbopi.checkpoint.lerobot import LeRobotFolder
-from turbopi.checkpoint.locate import Location, Recorded, locate, recorded_config, tokenizer_candidates
+from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
-from turbopi.checkpoint.sizes import VARIANTS, detect_kind, model_sizes
+from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.config import PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.model.reference import parameter_shapes
 
@@ -36,44 +37,27 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     kind = detect_kind(source, location.weights)
     if location.format == "lerobot":
         return _open_lerobot(location, settings, source)
-    recorded = recorded_config(location)
-    policy = policy_config(
-        settings,
-        kind,
-        horizon=recorded.numbers.get("action_horizon"),
-        assets=asset_ids(location.assets),
-        where=location.folder,
-    )
-    policy = _with_sizes(policy, source, settings, location)
-    _check_recorded(recorded, policy.model, location.folder)
-    stats, asset_id = find_norm_stats(location.assets, policy.asset_id, policy.normalization)
+    folder = location.folder
+
+    def policy_of(settings: Settings) -> PolicyConfig:
+        return policy_config(settings, kind, assets=asset_ids(folder / "assets"), where=folder)
+
+    policy = _with_sizes(policy_of(settings), source, settings, location)
+    found = find_norm_stats(folder, policy.asset_id, policy.normalization)
+    source.notes += found.notes
+    if location.format != "onnx":
+        source.notes += notes_on_config_json(folder, source, policy)
+    source.notes += notes_on_settings(folder, settings, replace(policy, asset_id=found.asset_id), policy_of)
     return Checkpoint(
-        path=location.folder,
+        path=folder,
         config=policy,
         config_source=settings.source,
-        norm_stats=stats,
+        norm_stats=found.stats,
         source=source,
-        asset_id=asset_id,
+        asset_id=found.asset_id,
         expected_sha256=settings.weights_sha256,
-        tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
+        tokenizer_candidates=tuple(tokenizer_candidates(folder)),
     )
-
-
-def _check_recorded(recorded: Recorded, model: ModelConfig, folder: Path) -> None:
-    """CheckpointError if openpi's config.json is about other weights. A size's name that openpi hasn't is a fork's."""
-    other = "one of the files belongs to another checkpoint"
-    if (dim := recorded.numbers.get("action_dim", model.action_dim)) != model.action_dim:
-        raise CheckpointError(
-            f"{folder}: config.json has action_dim {dim}, but the weights have {model.action_dim}; {other}"
-        )
-    for key, ours in (("paligemma_variant", model.vlm), ("action_expert_variant", model.expert)):
-        name = recorded.variants.get(key, "")
-        known = VARIANTS.get(name.removesuffix("_lora"), ours)
-        if known != ours:
-            raise CheckpointError(
-                f"{folder}: config.json has {key} {name}, which is {known.width} wide with {known.depth} layers and an "
-                f"MLP of {known.mlp_dim}, but the weights have {ours.width}, {ours.depth} and {ours.mlp_dim}; {other}"
-            )
 
 
 def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[str, Any]:
@@ -88,14 +72,16 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         location = locate(path)
         settings = _without_policy(config, location)
         source = open_weights(location, settings)
+        if location.format in ("openpi_torch", "openpi_jax"):
+            source.notes += notes_on_config_json(location.folder, source, None)
         return {
             **describe_weights(source),
             "path": str(location.folder),
             "random_weights": False,
             "kind": detect_kind(source, location.weights),
-            "assets": asset_ids(location.assets),
+            "assets": asset_ids(location.folder / "assets"),
             **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
-            **recorded_config(location).numbers,
+            **dict(zip(("action_dim",), source.shapes.get("action_in_proj.weight", ())[1:2], strict=False)),
             "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
             "config_error": str(error),
         }
@@ -119,6 +105,12 @@ def _lerobot_statistics(location: Location, settings: Settings) -> dict[str, Any
 
 def open_weights(location: Location, settings: Settings) -> WeightSource:
     """The weights at a location, names and shapes only."""
+    source = _source(location, settings)
+    source.notes[:0] = location.notes
+    return source
+
+
+def _source(location: Location, settings: Settings) -> WeightSource:
     if location.format == "openpi_jax":
         return JaxSource(location.weights, settings.lora)
     if settings.values.keys() & {"lora_alpha", "lora_rslora"}:
@@ -143,17 +135,25 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
         what = "an adapter itself: merge it" if base.adapter else "openpi's JAX format: convert it (turbopi convert)"
         raise CheckpointError(f"the base model of {location.folder} is {base.folder}, which is {what} first")
     weights = TorchSource(base.weights, format="lerobot", prefix="model.")
+    weights.notes[:0] = base.notes
     return PeftSource(location.folder, weights, base.folder)
 
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
-    folder = LeRobotFolder(location.folder, settings, untied=getattr(source, "untied", False))
+    untied = getattr(source, "untied", False)
+    folder = LeRobotFolder(location.folder, settings, untied=untied)
     policy = _with_sizes(folder.policy_config(), source, settings, location)
     if policy.model.kind != folder.kind:
         raise CheckpointError(
             f"{location.folder}: config.json says {folder.kind}, but these are {policy.model.kind} weights"
         )
     source.notes.extend(folder.notes())
+    source.notes += notes_on_settings(
+        location.folder,
+        settings,
+        policy,
+        lambda other: LeRobotFolder(location.folder, other, untied=untied).policy_config(),
+    )
     return Checkpoint(
         path=location.folder,
         config=policy,

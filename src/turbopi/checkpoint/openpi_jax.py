@@ -12,9 +12,10 @@ import torch
 from turbopi.checkpoint.jax_layout import VISION_QUERY, Rule, path_of, rules
 from turbopi.checkpoint.openpi_lora import Adapter, LoraScale, find_adapters, merged
 from turbopi.checkpoint.orbax import OrbaxTree
-from turbopi.checkpoint.source import PIECE_BYTES, Piece, Shape, row_ranges
+from turbopi.checkpoint.source import PIECE_BYTES, Piece, Shape, check_zeros, row_ranges
 from turbopi.config import LIMITS
 from turbopi.errors import CheckpointError
+from turbopi.reading import files_below
 
 
 class JaxSource:
@@ -41,8 +42,10 @@ class JaxSource:
         kernel = arrays.get(VISION_QUERY, ())
         self.vision_heads: int | None = kernel[-2] if len(kernel) == 4 else None
         self.notes = [*self._store.notes, *([self._adapter_note()] if adapters else [])]
-        self.files = sorted(path for path in folder.rglob("*") if path.is_file())
+        self.files = list(files_below(folder, hidden=True))
         self.variant = repr(lora) if adapters else ""
+        empty = [name for name, rule in self._rules.items() if rule.path in self._store.empty]
+        check_zeros(self, empty, folder)  # the tree's notes name each
 
     def native_name(self, name: str) -> str:
         return path_of(name) or name

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from turbopi.checkpoint.source import Shape, listing
 from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, is_integer, one_line, parse_json, read_json
+from turbopi.reading import Fields, files_below, is_integer, one_line, open_file, parse_json, read_json
+from turbopi.reading.files import HEAD_BYTES, failed_download
 
 MANIFEST = "manifest.ocdbt"
 _DTYPES = {"float32": "F32", "<f4": "F32", "bfloat16": "BF16", "float16": "F16", "<f2": "F16"}
@@ -41,7 +42,14 @@ class OrbaxTree:
         self._keys: dict[str, str] = {}  # path -> key prefix in the store
         self._zarr3 = False
         self._sparse: set[str] = set()  # paths whose absent chunks are zeros
+        self.empty: set[str] = set()  # paths of which no chunk is stored
         if not (folder / MANIFEST).is_file():
+            unfinished = sorted(entry.name for entry in folder.glob("ocdbt.process_*"))
+            if unfinished:
+                raise CheckpointError(
+                    f"{folder} has {listing(unfinished)}, but no {MANIFEST}, which Orbax writes last: the save was "
+                    "interrupted, or the copy is incomplete. Take an earlier step, or copy it anew"
+                )
             raise CheckpointError(
                 f"{folder} has no {MANIFEST}: either the download is incomplete, or the checkpoint is in Orbax's older "
                 "format of one folder an array, which Turbo-Pi doesn't read; re-save it with openpi's Orbax"
@@ -50,6 +58,15 @@ class OrbaxTree:
 
     def open(self, path: str) -> "OrbaxArray":
         return OrbaxArray(self, path)
+
+    def damaged(self, text: str) -> CheckpointError:
+        """The error to raise, with the file that isn't what it should be if one tells so."""
+        for file in files_below(self.folder, hidden=True):
+            with open_file(file) as stream:
+                found = failed_download(stream.read(HEAD_BYTES))
+            if found is not None:
+                return CheckpointError(f"{self.folder}: {text}: {file} {found}")
+        return CheckpointError(f"{self.folder}: {text}")
 
     def nbytes(self, path: str) -> int:
         return prod(self.shapes[path]) * self.itemsize(path)
@@ -69,7 +86,7 @@ class OrbaxTree:
             context = ts.Context({"file_io_mode": {"mode": "memmap"}, "cache_pool": {"total_bytes_limit": cache_bytes}})
             array = ts.open(spec, open=True, read=True, context=context).result()
         except Exception as reason:  # tensorstore raises several classes for damage, none of them its own
-            raise CheckpointError(f"{self.folder}: {path} can't be opened ({one_line(reason)})") from reason
+            raise self.damaged(f"{path} can't be opened ({one_line(reason)})") from reason
         if tuple(array.shape) != self.shapes[path]:
             raise CheckpointError(
                 f"{self.folder}: {path} opens with shape {list(array.shape)}, but its description says "
@@ -95,7 +112,7 @@ class OrbaxTree:
             arrays = {key.removesuffix(suffix) for key in keys if key.endswith(suffix)}
             described = {key: store.read(key + suffix).result().value for key in sorted(arrays)}
         except Exception as reason:  # as in `tensorstore`
-            raise CheckpointError(f"{self.folder} can't be read as an OCDBT store ({one_line(reason)})") from reason
+            raise self.damaged(f"it can't be read as an OCDBT store ({one_line(reason)})") from reason
         rootless = [key for key in described if not key.startswith("params.")]
         if rootless or not described:
             what = f"holds {listing(rootless)}" if rootless else "is empty"
@@ -124,6 +141,8 @@ class OrbaxTree:
                 f"{self.folder}: {path} has {stored} of its {needed} chunks; the download is incomplete or damaged"
             )
         self._sparse.add(path)
+        if not stored:
+            self.empty.add(path)
         self.notes.append(f"{needed - stored} of {needed} chunks of {path} aren't stored: read as zeros, as Orbax does")
 
 
@@ -131,7 +150,7 @@ class OrbaxArray:
     """A stored array; indexing reads a tensor."""
 
     def __init__(self, tree: OrbaxTree, path: str) -> None:
-        self._where = f"{tree.folder}: {path}"
+        self._tree, self._path = tree, path
         array = tree.tensorstore(path, cache_bytes=0)
         chunk = array.chunk_layout.read_chunk.shape
         rest = prod(ceil(size / part) * part for size, part in zip(array.shape[1:], chunk[1:], strict=True))
@@ -142,8 +161,8 @@ class OrbaxArray:
         try:
             values = self._array[index].read().result()
         except Exception as reason:  # as in `OrbaxTree.tensorstore`
-            raise CheckpointError(
-                f"{self._where} can't be read ({one_line(reason)}); the file is damaged or incomplete: copy it anew"
+            raise self._tree.damaged(
+                f"{self._path} can't be read ({one_line(reason)}); the file is damaged or incomplete: copy it anew"
             ) from reason
         if values.dtype.name == "bfloat16":  # NumPy's is foreign to torch
             return torch.from_numpy(values.view("int16")).view(torch.bfloat16)

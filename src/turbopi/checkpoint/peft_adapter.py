@@ -24,7 +24,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from turbopi.checkpoint.names import TIED_HEAD, UNUSED_HEAD, from_openpi
+from turbopi.checkpoint.names import TIED_HEAD, UNUSED_HEAD, current_name, from_openpi
 from turbopi.checkpoint.source import Piece, listing
 from turbopi.checkpoint.torch_files import ITEMSIZE, Stored, TorchSource, read_header, read_tensor
 from turbopi.checkpoint.torch_files import WEIGHTS as MODEL
@@ -152,7 +152,7 @@ class PeftSource:
 
     def _target(self, key: str, stored: Stored) -> str:
         """The canonical name of the parameter at `key`; "" for heads, which no action is computed from."""
-        if key in (TIED_HEAD, UNUSED_HEAD):
+        if current_name(key) in (TIED_HEAD, UNUSED_HEAD):
             return ""
         name = from_openpi(key)
         if name not in self._base.shapes:

@@ -98,7 +98,7 @@ def _configured(base: PolicyConfig, settings: Settings) -> PolicyConfig:
         config = with_values(base, settings)
     else:
         where = Path(f"the preset {base.name} of the random weights")
-        config = policy_config(settings, base.model.kind, horizon=None, assets=[], where=where)
+        config = policy_config(settings, base.model.kind, assets=[], where=where)
     free = {name: getattr(config.model, name) for name in ("action_horizon", "max_prompt_tokens", "time_grid")}
     return replace(config, model=replace(base.model, **free))
 

@@ -34,8 +34,8 @@ itself.
 Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
 the weights as a whole.
 
-The horizon: the .json's, else config.json's `action_horizon`, else the preset's. A PolicyConfig is taken at its word,
-except for sizes, which always come from the tensors.
+The horizon: the .json's, else the preset's; never config.json's, which openpi doesn't read. A PolicyConfig is taken at
+its word, except for sizes, which always come from the tensors. Other files that say otherwise are in the notes.
 """
 
 import re
@@ -97,13 +97,11 @@ def read_settings(config: ConfigSource, folder: Path) -> Settings:
     )
 
 
-def policy_config(
-    settings: Settings, kind: Kind, *, horizon: int | None, assets: list[str], where: Path
-) -> PolicyConfig:
+def policy_config(settings: Settings, kind: Kind, *, assets: list[str], where: Path) -> PolicyConfig:
     """The policy of an openpi checkpoint, sizes still the preset's.
 
-    `horizon` is what the checkpoint's config.json records, `assets` the asset ids it has. Raises ConfigError, listing
-    the presets that fit, if nothing says which robot it is for.
+    `assets` are the asset ids it has. Raises ConfigError, listing the presets that fit, if nothing says which robot it
+    is for.
     """
     if settings.policy is not None:
         _check_kind(settings.policy, kind, settings.source, where)
@@ -117,34 +115,43 @@ def policy_config(
         )
     preset = PRESETS[settings.values["preset"]]
     _check_kind(preset, kind, settings.source, where)
-    config = preset if horizon is None else preset.with_model(action_horizon=horizon)
-    return with_values(config, settings)
+    return with_values(preset, settings)
+
+
+_OF_POLICY = (
+    "name",
+    "robot",
+    "robot_options",
+    "normalization",
+    "discrete_state_input",
+    "asset_id",
+    "default_prompt",
+    "image_resize",
+    "prompt_state_dim",
+    "prompt_as_is",
+    "num_denoising_steps",
+    "solver",
+    "solver_grid",
+    "real_time",
+)
+_OF_MODEL = ("action_horizon", "max_prompt_tokens", "time_grid")
+
+
+def values_of(config: PolicyConfig) -> dict[str, object]:
+    """What a .json may say of a policy, and this one has."""
+    return {
+        **{key: getattr(config, key) for key in _OF_POLICY},
+        **{key: getattr(config.model, key) for key in _OF_MODEL},
+    }
 
 
 def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     """`config` with the values of a .json over it."""
     values = settings.values
-    names = (
-        "name",
-        "robot",
-        "robot_options",
-        "normalization",
-        "discrete_state_input",
-        "asset_id",
-        "default_prompt",
-        "image_resize",
-        "prompt_state_dim",
-        "prompt_as_is",
-        "num_denoising_steps",
-        "solver",
-        "solver_grid",
-        "real_time",
-    )
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
         config = replace(config, robot_options={})
-    config = replace(config, **{key: values[key] for key in names if key in values})
-    model = {key: values[key] for key in ("action_horizon", "max_prompt_tokens", "time_grid") if key in values}
-    config = config.with_model(**model)
+    config = replace(config, **{key: values[key] for key in _OF_POLICY if key in values})
+    config = config.with_model(**{key: values[key] for key in _OF_MODEL if key in values})
     check_real_time(config, settings.source)
     if config.model.kind == "pi0" and config.discrete_state_input:
         raise ConfigError(f"{settings.source}: discrete_state_input is true, but Pi0 reads its state as a number token")

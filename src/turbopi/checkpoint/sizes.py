@@ -45,6 +45,9 @@ def detect_kind(source: WeightSource, where: object) -> Kind:
         )
     if bool(pi05) == bool(pi0):
         found = f"tensors of both ({pi05[0]}, {pi0[0]})" if pi05 else "neither time_mlp_in (Pi0.5) nor state_proj (Pi0)"
+        if not pi05:
+            first = {name.split(".")[0].split("/")[0]: source.native_name(name) for name in sorted(names, reverse=True)}
+            found += f". Of its {len(names)} tensors the first of each module: {listing(sorted(first.values()))}"
         raise CheckpointError(f"{where} is neither Pi0.5 nor Pi0: it has {found}")
     return "pi05" if pi05 else "pi0"
 

@@ -77,6 +77,27 @@ def check_tensors(source: WeightSource, expected: Mapping[str, Shape], path: Pat
         raise CheckpointError(f"{path}: the weights don't fit the model: " + "; ".join(problems) + adapter_hint(extra))
 
 
+def judged_for_zeros(name: str, shape: Shape) -> bool:
+    """Whether training leaves no zeros here. Norms' scales are stored less 1, and adaRMS layers start as zeros."""
+    return len(shape) > 1 and all(shape) and "norm" not in name
+
+
+def check_zeros(source: WeightSource, empty: Sequence[str], path: Path | None) -> list[str]:
+    """CheckpointError if so many matrices hold nothing but zeros that some of the file is missing; a note on a few.
+
+    `empty`: canonical names of the tensors that are all zero, whatever their kind. One layer may be zeroed on purpose,
+    a tenth of the model isn't.
+    """
+    judged = [name for name, shape in source.shapes.items() if judged_for_zeros(name, shape)]
+    zero = [source.native_name(name) for name in judged if name in set(empty)]
+    if not zero:
+        return []
+    text = f"{len(zero)} of the model's {len(judged)} matrices hold nothing but zeros: {listing(zero)}"
+    if 10 * len(zero) >= len(judged):
+        raise CheckpointError(f"{path}: {text}. The file is there in part: download or copy it again")
+    return [text]
+
+
 def check_finite(values: Tensor, name: str, path: Path | None) -> None:
     """CheckpointError if one of `values` is NaN or infinite. `name` is what the checkpoint calls them."""
     if values.sum().isfinite() or values.isfinite().all():  # the first takes a thirtieth of the second's time

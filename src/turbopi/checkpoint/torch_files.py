@@ -1,7 +1,13 @@
-"""openpi's PyTorch layout and LeRobot's: safetensors, memory-mapped, tensor by tensor."""
+"""openpi's PyTorch layout and LeRobot's: safetensors, memory-mapped, tensor by tensor.
+
+A download that set its space aside and stopped leaves zeros, which safetensors can't tell from weights. So when a file
+is opened, one row in the middle of every matrix is read: some 400 rows of a few kilobytes, which loading reads anyway.
+A matrix whose row is zero is read whole. Biases aren't judged, nor are norms, whose scales (stored less 1) and adaRMS
+layers start as zeros.
+"""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,10 +15,20 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from turbopi.checkpoint.names import EMBEDDING, TIED_EMBEDDING, TIED_HEAD, UNUSED_HEAD, from_openpi, to_openpi
-from turbopi.checkpoint.source import Piece, Shape, listing, row_ranges
+from turbopi.checkpoint.names import (
+    EMBEDDING,
+    TIED_EMBEDDING,
+    TIED_HEAD,
+    UNUSED_HEAD,
+    common_prefix,
+    current_name,
+    from_openpi,
+    to_openpi,
+)
+from turbopi.checkpoint.source import Piece, Shape, check_zeros, judged_for_zeros, listing, row_ranges
 from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, one_line, read_json
+from turbopi.reading import Fields, one_line, open_file, read_json
+from turbopi.reading.files import HEAD_BYTES, failed_download
 
 ITEMSIZE = {"F32": 4, "BF16": 2, "F16": 2}
 WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -29,29 +45,31 @@ class Stored:
 
 
 class TorchSource:
-    """`model.safetensors` (or its shards) in `folder`; names may carry `prefix` (LeRobot's `model.`)."""
+    """`model.safetensors` (or, without it, the shards of an index) in `folder`.
+
+    Names may carry `prefix` (LeRobot's `model.`), or all of them a wrapper's.
+    """
 
     vision_heads: int | None = None  # no tensor of this layout tells
 
     def __init__(self, folder: Path, *, format: str, prefix: str = "") -> None:
         self.format = format
         self.notes: list[str] = []
-        self._prefix = prefix
+        stored_tensors = _read_headers(folder)
+        self._prefix = common_prefix([stored.key for stored in stored_tensors]) or prefix
+        if self._prefix != prefix:
+            self.notes.append(f"all names in {WEIGHTS} begin with {self._prefix}: read without it")
         self._stored: dict[str, Stored] = {}
         heads: dict[str, Stored] = {}
         self.untied = False  # whether lm_head and the embedding are both stored
-        for file in _weight_files(folder):
-            for stored in read_header(file):
-                key = stored.key.removeprefix(prefix) if prefix else stored.key
-                if key == UNUSED_HEAD:
-                    continue
-                if key in (TIED_HEAD, TIED_EMBEDDING):
-                    heads[key] = stored
-                    continue
-                name = from_openpi(key)
-                if name in self._stored:
-                    raise CheckpointError(f"{folder}: {self._stored[name].key} and {stored.key} are the same parameter")
-                self._stored[name] = stored
+        for stored in stored_tensors:
+            key = current_name(stored.key.removeprefix(self._prefix))
+            if key == UNUSED_HEAD:
+                continue
+            kind, name = (heads, key) if key in (TIED_HEAD, TIED_EMBEDDING) else (self._stored, from_openpi(key))
+            if name in kind:
+                raise CheckpointError(f"{folder}: {kind[name].key} and {stored.key} are the same parameter")
+            kind[name] = stored
         if heads:
             self._stored[EMBEDDING] = self._tied(heads, folder)
             self.untied = len(heads) == 2
@@ -65,6 +83,8 @@ class TorchSource:
         self.shapes = {name: stored.shape for name, stored in self._stored.items()}
         self.dtypes = {name: stored.dtype for name, stored in self._stored.items()}
         self.files = sorted({stored.file for stored in self._stored.values()})
+        empty = [name for name in _sampled_zero(self._stored) if not read_tensor(self._stored[name]).any()]
+        self.notes += check_zeros(self, empty, folder)
 
     def native_name(self, name: str) -> str:
         return self._stored[name].key if name in self._stored else self._prefix + to_openpi(name)
@@ -102,22 +122,53 @@ class TorchSource:
         return embedding
 
 
-def _weight_files(folder: Path) -> list[Path]:
+def _read_headers(folder: Path) -> list[Stored]:
+    """All tensors: of the single file, which openpi, LeRobot and transformers prefer, else of the index's shards."""
+    if (folder / WEIGHTS).is_file():
+        return read_header(folder / WEIGHTS)
     index = folder / INDEX
-    if not index.exists():
-        return [folder / WEIGHTS]
+    weight_map = read_index(index)
+    absent = [name for name in sorted(set(weight_map.values())) if not (folder / name).is_file()]
+    if absent:
+        none = "none of its files are there" if len(absent) == len(set(weight_map.values())) else "files are missing"
+        raise CheckpointError(
+            f"{index} lists files that aren't there: {listing(absent)}; the download is incomplete: {none}"
+        )
+    found = [stored for name in sorted(set(weight_map.values())) for stored in read_header(folder / name)]
+    holders = {(stored.key, stored.file.name) for stored in found}
+    elsewhere = [f"{key} in {name}" for key, name in weight_map.items() if (key, name) not in holders]
+    if elsewhere:
+        raise CheckpointError(
+            f"{index} lists {listing(elsewhere)}, but the files hold something else: they and the index belong to "
+            "different checkpoints. Copy one of them anew, whole"
+        )
+    return found
+
+
+def read_index(index: Path) -> dict[str, str]:
+    """{tensor: file}. CheckpointError for anything but plain names of files beside it."""
     weight_map = Fields(read_json(index), f"{index} isn't a safetensors index").object("weight_map").values
     odd = [str(name) for name in weight_map.values() if not re.fullmatch(r"[^/\\]{1,200}\.safetensors", str(name))]
-    names = sorted(set(map(str, weight_map.values())))
-    if odd or not names:
+    if odd or not weight_map:
         raise CheckpointError(
             f"{index} names {listing(odd) or 'no file'}; expected plain names of .safetensors files beside it. Weights "
             "are read from that folder alone"
         )
-    absent = [name for name in names if not (folder / name).is_file()]
-    if absent:
-        raise CheckpointError(f"{index} lists files that aren't there: {listing(absent)}; the download is incomplete")
-    return [folder / name for name in names]
+    return {key: str(name) for key, name in weight_map.items()}
+
+
+def _sampled_zero(tensors: Mapping[str, Stored]) -> list[str]:
+    """The matrices whose middle row is all zero, by their parameters' names."""
+    found = []
+    for file in {stored.file for stored in tensors.values()}:
+        with safe_open(file, "pt") as handle:
+            for name, stored in tensors.items():
+                if stored.file != file or not judged_for_zeros(name, stored.shape):
+                    continue
+                middle = stored.shape[0] // 2
+                if not handle.get_slice(stored.key)[middle : middle + 1].any():
+                    found.append(name)
+    return found
 
 
 def read_header(file: Path) -> list[Stored]:
@@ -130,6 +181,10 @@ def read_header(file: Path) -> list[Stored]:
                 stored.append(Stored(file, key, tuple(tensor.get_shape()), tensor.get_dtype()))
             return stored
     except (SafetensorError, OSError) as error:
+        with open_file(file, hint="; is the download complete?") as stream:
+            found = failed_download(stream.read(HEAD_BYTES))
+        if found is not None:
+            raise CheckpointError(f"{file} {found}") from error
         raise CheckpointError(
             f"{file} can't be read as safetensors ({one_line(error)}); is the download complete?"
         ) from error

@@ -136,10 +136,14 @@ def _show(info: dict[str, Any], output: Output) -> None:
     parameters.add_section()
     parameters.add_row("total", f"{info['parameters']['total']:,}", style="bold")
     output.table(parameters)
-    for note in info["notes"]:
-        output.line(f"note: {note}", "yellow")
+    _show_notes(info["notes"], output)
     if "config_error" in info:
         output.line(f"not known yet: {info['config_error']}", "yellow")
+
+
+def _show_notes(notes: list[str], output: Output) -> None:
+    for note in notes:
+        output.line(f"note: {note}", "yellow")
 
 
 def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
@@ -256,6 +260,8 @@ def convert(
     if options.robot is not None:
         opened = _for_robot(opened, options.robot)
     options.tell_if_random(opened, output)
+    if opened.format != "random":
+        _show_notes(opened.source.notes, output)
     started = time.perf_counter()
     folder = write(opened, Path(target), precision=precision, progress=output.shows_progress)  # type: ignore[arg-type]
     seconds = time.perf_counter() - started

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -118,6 +119,30 @@ def replaced(changes: list[tuple[nn.Linear, Round, Round]]) -> Iterator[None]:
 
 
 # -- errors of actions -------------------------------------------------------------------------------------------------
+
+
+NO_SIGNAL = (
+    "the float32 reference's actions, or what denoising did (actions less noise), are zero or constant, so that any "
+    "other model would agree. Weights or statistics are missing or damaged"
+)
+
+
+def has_signal(actions: np.ndarray, noise: np.ndarray) -> bool:
+    """Whether actions and what denoising did (actions less noise) differ from row to row, both [..., H, d].
+
+    Where they are zero or constant, or NaN, any two models agree: there is nothing to judge by. Float32 rounding alone
+    moves sums of the noise's size by 1e-7 of it, so less than 1e-6 counts as constant.
+    """
+    return all(_spread(values) > 1e-6 * max(_rms(noise), _rms(values)) for values in (actions, actions - noise))
+
+
+def _spread(values: np.ndarray) -> float:
+    rows = values.reshape(-1, values.shape[-1]).astype(np.float64)
+    return _rms(rows - rows.mean(axis=0 if len(rows) > 1 else None))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
 def delta_cosine(actions: Tensor, exact: Tensor, noise: Tensor) -> float:

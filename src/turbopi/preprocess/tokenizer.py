@@ -5,6 +5,7 @@ task alone, followed by a newline that is encoded by itself. Source: openpi's `t
 Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcessor`).
 """
 
+import filecmp
 import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -155,10 +156,13 @@ def load_tokenizer(
     if source is not None:
         return _open(_given_file(Path(source).expanduser()), vocab_size)
     places = _places(checkpoint_dir, candidates)
-    for path in places:
-        if path.is_file():
-            return _open(path, vocab_size)
-    raise TokenizerError(_not_found(places))
+    there = [path for path in places if path.is_file()]
+    if not there:
+        raise TokenizerError(_not_found(places))
+    for other in there[1:]:
+        if other != cached_tokenizer() and not filecmp.cmp(there[0], other, shallow=False):
+            logger.warning("two sources of the tokenizer: %s is read, and %s differs", there[0], other)
+    return _open(there[0], vocab_size)
 
 
 def _given_file(path: Path) -> Path:

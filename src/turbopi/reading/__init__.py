@@ -19,7 +19,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 from turbopi.reading.fields import Fields, is_finite, is_integer
-from turbopi.reading.files import file_inside, listing, one_line, open_file, read_bytes, shown
+from turbopi.reading.files import file_inside, files_below, listing, one_line, open_file, read_bytes, shown
 from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ __all__ = [
     "Npz",
     "as_document",
     "file_inside",
+    "files_below",
     "is_finite",
     "is_integer",
     "listing",

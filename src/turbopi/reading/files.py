@@ -4,7 +4,7 @@ import os
 import re
 import reprlib
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -59,7 +59,50 @@ def read_bytes(file: str | Path, error: Error = CheckpointError, *, limit: int, 
         raise error(f"{file} can't be read: {reason.strerror or reason}{hint}") from reason
     if len(data) > limit:
         raise error(f"{file} has more than {limit} bytes, the most that is read of a file of its kind")
+    if (found := failed_download(data)) is not None:
+        raise error(f"{file} {found}")
     return data
+
+
+_LFS = b"version https://git-lfs.github.com/spec/"
+HEAD_BYTES = 64  # that `failed_download` looks at
+
+
+def failed_download(data: bytes) -> str | None:
+    """What a file is instead of itself, by its first bytes, and what to do; None: nothing that is known."""
+    if data.startswith(_LFS):
+        return "is a Git-LFS pointer, not the file itself: `git lfs pull` in its repository, or download it"
+    if data[:HEAD_BYTES].lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        return "is a web page, not the file itself: download it by its own link (on Hugging Face /resolve/, not /blob/)"
+    if len(data) >= 8 and not any(data[:HEAD_BYTES]):
+        return "begins with zeros: a download set its space aside and didn't fill it; download it again"
+    return None
+
+
+def files_below(folder: Path, *, hidden: bool = False, depth: int = 16) -> Iterator[Path]:
+    """The regular files in a folder and below it, sorted within each. Links are followed, but never in a circle.
+
+    Hidden files and folders (.git, .ipynb_checkpoints, .cache) are left out unless `hidden`, and what can't be read.
+    """
+    return _files_below(folder, hidden, depth, ())
+
+
+def _files_below(folder: Path, hidden: bool, depth: int, above: tuple[tuple[int, int], ...]) -> Iterator[Path]:
+    try:
+        state = folder.stat()
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return
+    here = (state.st_dev, state.st_ino)
+    if here in above:
+        return
+    for entry in entries:
+        if entry.name.startswith(".") and not hidden:
+            continue
+        if entry.is_file():
+            yield entry
+        elif depth and entry.is_dir():
+            yield from _files_below(entry, hidden, depth - 1, (*above, here))
 
 
 def open_file(file: str | Path, error: Error = CheckpointError, *, hint: str = "") -> IO[bytes]:

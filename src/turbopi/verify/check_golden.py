@@ -25,6 +25,8 @@ from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.calibrate.statistics import Method
 from turbopi.config import Kind
+from turbopi.engine.emulate import NO_SIGNAL, has_signal
+from turbopi.errors import CheckpointError
 from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
@@ -140,6 +142,7 @@ def check_case(case: Case, backend: backends.Backend) -> list[Comparison]:
     """
     comparisons = []
     for run in case.runs:
+        _check_signal(case, run)
         ours = _as_arrays(backend.intermediates(case.observation, case.noise, run.num_steps))
         ours["actions"] = backend.sample(case.observation, case.noise, run.num_steps).actions.numpy()
         if backend.precision == "f32":
@@ -179,11 +182,18 @@ def _compare_rounded(case: Case, run: Run, ours: Arrays, precision: Precision) -
         else:
             worst = _openpi_bf16_error(name, run, case)
             bound = None if worst is None else max(BF16_FACTOR * worst, FLOAT32_ROUNDING)
-        ok = None if bound is None else relative <= bound
+        ok = None if bound is None else relative <= bound < float("inf")  # inf: openpi's own bf16 isn't finite
         comparisons.append(
             Comparison(case.name, run.num_steps, precision, against, name, max_, rms, relative, bound, ok)
         )
     return comparisons
+
+
+def _check_signal(case: Case, run: Run) -> None:
+    """CheckpointError if openpi's actions are such that any backend would agree."""
+    for variant, arrays in run.variants.items():
+        if "actions" in arrays and not has_signal(arrays["actions"], case.noise.numpy()):
+            raise CheckpointError(f"{case.name}, {variant}, {run.num_steps} steps: nothing to judge: {NO_SIGNAL}")
 
 
 def _openpi_bf16_error(name: str, run: Run, case: Case) -> float | None:

@@ -100,7 +100,7 @@ class IntermediateDocument(Struct, frozen=True, kw_only=True):
 class Check(Struct, frozen=True):
     """One of the things that decide."""
 
-    name: str  # "actions", "deltas", "finite", "determinism"
+    name: str  # "signal", "actions", "deltas", "finite", "determinism"
     ok: bool
     value: int | float | None
     bound: int | float | None

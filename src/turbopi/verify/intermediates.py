@@ -131,7 +131,7 @@ class Errors:
 
     @property
     def cosine(self) -> float:
-        if not self.finite:
+        if not self.finite or not self._exact:  # of nothing but zeros there is none
             return float("nan")
         if self._difference == 0:
             return 1.0

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import asdict
 
+from turbopi.engine.emulate import NO_SIGNAL, has_signal
 from turbopi.errors import BackendError, ConfigError
 from turbopi.examples import NoisyExample
 from turbopi.quantization.plan import TIERS
@@ -115,6 +116,7 @@ class Compared:
     by_dimension: list[Errors] = field(default_factory=list)  # robot units
     by_call: list[tuple[NoisyExample, Errors]] = field(default_factory=list)  # actions
     deltas: Errors = field(default_factory=Errors)  # what denoising did: actions less noise
+    exact: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # the reference's actions, the noise
 
     def add(
         self, call: NoisyExample, tensors: Tensors, exact: Tensors, robot: np.ndarray, exact_robot: np.ndarray
@@ -132,6 +134,7 @@ class Compared:
         self.by_call.append((call, of_call))
         noise = call.noise[0].numpy()
         self.deltas.add(tensors[ACTIONS] - noise, exact[ACTIONS] - noise)
+        self.exact.append((exact[ACTIONS], noise))
         self.by_dimension = self.by_dimension or [Errors() for _ in range(robot.shape[1])]
         for index, errors in enumerate(self.by_dimension):
             errors.add(robot[:, index], exact_robot[:, index])
@@ -139,6 +142,12 @@ class Compared:
     @property
     def actions(self) -> Errors:
         return self.by_place[ACTIONS]
+
+    @property
+    def has_signal(self) -> bool:
+        """Whether the reference's actions can tell a right backend from a wrong one."""
+        actions, noise = (np.concatenate(some) for some in zip(*self.exact, strict=True))
+        return has_signal(actions, noise)
 
     @property
     def worst(self) -> tuple[NoisyExample, Errors]:
@@ -214,6 +223,7 @@ def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, rep
     else:
         text = "the actions aren't finite"
     wrong = [place for place in in_order(compared.by_place) if not compared.by_place[place].finite]
+    judged = _signal(rule, limit, compared, control)
     same = repetition.identical == repetition.calls
     cosine = compared.deltas.cosine
     did = f"cosine of what denoising did is {cosine:.5f}, at least {rule.cosine} is stated"
@@ -222,11 +232,25 @@ def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, rep
     repeated = f"{repetition.identical} of {repetition.calls} repeated calls were bit-identical"
     repeated += "" if same else f" (off by up to {significant(repetition.max)})"
     return [
+        *([] if judged.ok else [judged]),
         Check("actions", ok, finite(error), finite(limit), text),
         *([] if rule.cosine is None else [of_deltas]),
         Check("finite", not wrong, len(wrong), 0, values),
         Check("determinism", same, repetition.calls - repetition.identical, 0, repeated),
+        *([judged] if judged.ok else []),
     ]
+
+
+def _signal(rule: Rule, limit: float, compared: Compared, control: Compared) -> Check:
+    """Whether there is anything that could fail: a reference that varies, and a control that gives a bound."""
+    why = ""
+    if not compared.has_signal:
+        why = NO_SIGNAL
+    elif rule.bound is None and not control.actions.finite:
+        why = "the control's actions aren't finite, so there is no bound"
+    elif rule.bound is None and not limit > 0:
+        why = "the control has no error, so there is no bound"
+    return Check("signal", not why, None, None, f"nothing to judge: {why}" if why else "the reference's actions vary")
 
 
 def _actions(robot: str, compared: Compared, control: Compared) -> ActionsDocument:

@@ -1,0 +1,91 @@
+"""Files beside the weights that say something about the policy and aren't read: notes where they say otherwise.
+
+config.json    openpi's converter and other tools write it beside openpi's weights. openpi itself never reads it.
+turbopi.json   `config=` replaces it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read_settings, values_of
+from turbopi.checkpoint.sizes import VARIANTS
+from turbopi.checkpoint.source import WeightSource, listing
+from turbopi.config import GemmaConfig, PolicyConfig
+from turbopi.errors import CheckpointError, ConfigError
+from turbopi.reading import read_json, shown
+
+CONFIG = "config.json"
+_DTYPES = {"bfloat16": "BF16", "bf16": "BF16", "float32": "F32", "fp32": "F32", "float16": "F16", "fp16": "F16"}
+
+
+def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfig | None) -> list[str]:
+    """Where the config.json of an openpi folder says otherwise than weights and policy (None: it isn't known yet)."""
+    file = folder / CONFIG
+    if not file.is_file():
+        return []
+    try:
+        said = {key: value for key, value in read_json(file).items() if value is not None}
+    except CheckpointError as error:
+        return [f"openpi doesn't read {CONFIG}, nor does Turbo-Pi: {error}"]
+    facts: dict[str, object] = {
+        "precision": " and ".join(sorted(set(source.dtypes.values()))),
+        "action_horizon": "the configuration's",
+    }
+    if policy is not None:
+        facts |= {
+            "action_dim": policy.model.action_dim,
+            "action_horizon": policy.model.action_horizon,
+            "max_token_len": policy.model.max_prompt_tokens,
+            "discrete_state_input": policy.discrete_state_input,
+            "pi05": policy.model.kind == "pi05",
+            "paligemma_variant": policy.model.vlm,
+            "action_expert_variant": policy.model.expert,
+        }
+    others = [
+        f"{key} = {shown(said[key])} (used: {_readable(fact)})"
+        for key, fact in facts.items()
+        if key in said and not _agrees(said[key], fact)
+    ]
+    return [f"{file} isn't read, nor does openpi read it. It says {', '.join(others)}"] if others else []
+
+
+def _agrees(said: object, fact: object) -> bool:
+    if isinstance(fact, GemmaConfig):  # a name that openpi hasn't is a fork's
+        return isinstance(said, str) and VARIANTS.get(said.removesuffix("_lora"), fact) == fact
+    if isinstance(fact, str):
+        return _DTYPES.get(str(said)) == fact
+    return type(said) is type(fact) and said == fact
+
+
+def _readable(fact: object) -> str:
+    if isinstance(fact, GemmaConfig):
+        return f"{fact.width} wide, {fact.depth} layers, an MLP of {fact.mlp_dim}"
+    return str(fact)
+
+
+def notes_on_settings(
+    folder: Path, given: Settings, policy: PolicyConfig, policy_of: Callable[[Settings], PolicyConfig]
+) -> list[str]:
+    """Where a turbopi.json says otherwise than the `config=` that replaces it; `policy_of` makes its policy."""
+    file = folder / FILE_NAME
+    if given.source == "auto" or not file.is_file() or file.resolve() == Path(given.source).resolve():
+        return []
+    unread = f"{file} isn't read: {given.source} replaces it"
+    try:
+        beside = read_settings("auto", folder)
+        theirs = values_of(policy_of(beside))
+    except (CheckpointError, ConfigError) as error:
+        return [f"{unread}. By itself it is refused: {error}"]
+    ours = values_of(policy)
+    others = [
+        f"{key} = {shown(value)} (used: {shown(ours[key])})"
+        for key, value in theirs.items()
+        if key != "name" and value != ours[key]
+    ]
+    heads = {"vision_heads": policy.model.vision.num_heads}
+    others += [
+        f"{key} = {shown(value)}"
+        for key, value in beside.values.items()
+        if key in {*ABOUT_WEIGHTS, *heads} and value != given.values.get(key, heads.get(key))
+    ]
+    return [f"{unread}. It says {listing(others, 20)}"] if others else []
