@@ -72,8 +72,8 @@ def tokenizer_config() -> dict[str, Any]:
 
 
 def write(folder: Path) -> Path:
-    """The two files in `folder`, which is made."""
-    folder.mkdir(parents=True)
+    """The two files in `folder`, which is made if it isn't there."""
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "tokenizer.json").write_text(json.dumps(tokenizer_json()))
     (folder / "tokenizer_config.json").write_text(json.dumps(tokenizer_config()))
     return folder
