@@ -44,7 +44,7 @@ def in_lerobot(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     }
     command = [str(PYTHON), *map(str, arguments)]
     return subprocess.run(
-        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600, check=False
+        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=800, check=False
     )
 
 
