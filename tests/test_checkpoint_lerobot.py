@@ -12,6 +12,7 @@ from lerobot_cases import tokenizer_folder
 from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
+from turbopi.checkpoint.convert import convert
 from turbopi.config import PRESETS, GemmaConfig, Normalization, RealTime, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError, ObservationError
 from turbopi.robots import create_robot
@@ -419,6 +420,16 @@ def test_a_tokenizers_name_is_the_folder_beside_the_processors(tmp_path: Path, d
     checkpoint = open_checkpoint(folder)
     assert checkpoint.named_tokenizer == folder / "tokenizer"
     assert checkpoint.info()["notes"] == []
+
+
+def test_a_converted_checkpoint_keeps_the_tokenizer_that_was_named(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    name_tokenizer(folder, str(tokenizer_folder.write(tmp_path / "elsewhere")), declared=False)
+    convert(folder, tmp_path / "converted", precision="f32")
+    assert (
+        tmp_path / "converted" / "tokenizer" / "tokenizer.json"
+        in open_checkpoint(tmp_path / "converted").tokenizer_candidates
+    )
 
 
 def test_a_tokenizer_elsewhere_on_this_machine_is_the_one_that_is_there_whatever_it_is_called(tmp_path: Path) -> None:
