@@ -330,7 +330,11 @@ def test_keys_that_lerobot_does_not_have_are_pointed_out(tmp_path: Path) -> None
 
 def test_keys_with_neutral_values_are_silent(tmp_path: Path) -> None:
     """All that LeRobot's main branch writes beside 0.6.1's keys."""
-    newer = {"use_visual_memory": False, "use_proprioceptive_memory": False, "rtc_training_max_delay": 0}
+    newer: dict[str, Any] = {
+        "use_visual_memory": False,
+        "use_proprioceptive_memory": False,
+        "rtc_training_max_delay": 0,
+    }
     newer |= {"memory_frames": 6, "memory_stride": 30, "memory_temporal_attention_every": 4}
     assert open_checkpoint(lerobot_copy(tmp_path / "c", **newer)).info()["notes"] == []
 

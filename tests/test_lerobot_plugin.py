@@ -26,6 +26,7 @@ REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()
 CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))
 OF_0_4 = "square_lerobot0.4.4"
+OTHER_SIZES = (OF_0_4, "rtc")  # than the small LeRobot of tools/lerobot_cases has: its own policy can't load them
 BF16 = 5e-3  # LeRobot's own bfloat16 from the float32 that is computed here; seen: half
 
 
@@ -61,7 +62,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name != OF_0_4 and "peft" not in name])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in OTHER_SIZES and "peft" not in name])
 def test_bfloat16_is_as_near_to_float32_as_lerobots(ran: Path, name: str) -> None:
     found = np.load(ran / name / "plugin.npz")
     ours, theirs = (rms(found[which], found["seeded"]) for which in ("bf16", "lerobot_bf16"))
@@ -80,7 +81,7 @@ def test_actions_are_lerobots(ran: Path, name: str) -> None:
     assert ("selected_actions" in stored) == (name != "rtc")
     selected = stored["selected_actions"] if "selected_actions" in stored else stored["0/actions"]
     assert difference(found["selected_actions"], selected) < bound
-    assert ("lerobot_seeded" in found) == ("peft" not in name)
+    assert ("lerobot_seeded" in found) == ("peft" not in name and name not in OTHER_SIZES)
     if "lerobot_seeded" in found:
         assert difference(found["seeded"], found["lerobot_seeded"]) < bound
         assert difference(found["seeded"], found["0/actions"]) > 0.1  # other noise: the comparison's control
