@@ -1,5 +1,6 @@
 """LeRobot's pi05 checkpoints: described by their own files, and refused where Turbo-Pi would compute something else."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 from checkpoint_helpers import GOLDEN, edit_json, edit_tensors, lerobot_copy, lerobot_statistics, write_json
-from safetensors.torch import load_file
+from lerobot_cases import tokenizer_folder
+from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
+from turbopi.checkpoint.convert import convert
 from turbopi.config import PRESETS, GemmaConfig, Normalization, RealTime, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError, ObservationError
 from turbopi.robots import create_robot
@@ -143,6 +146,9 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
         ({"paligemma_variant": "gemma_9b"}, "paligemma_variant is 'gemma_9b'; expected one of gemma_300m, gemma_2b"),
         ({"action_expert_variant": 300}, "action_expert_variant is 300; expected one of gemma_300m, gemma_2b"),
         ({"max_period": 8.0}, "max_period = 8.0"),
+        ({"use_visual_memory": True}, "use_visual_memory = True, which Turbo-Pi doesn't compute"),
+        ({"use_proprioceptive_memory": True, "use_visual_memory": False}, "use_proprioceptive_memory = True"),
+        ({"rtc_config": {"mode": "hard", "enabled": True}}, "mode is 'hard'; expected one of guided, trained"),
         ({"chunk_size": None}, "chunk_size is None; expected a whole number from 1"),
         ({"chunk_size": "50"}, "chunk_size is '50'; expected a whole number"),
         ({"empty_cameras": -1}, "empty_cameras is -1; expected a whole number from 0"),
@@ -317,7 +323,146 @@ def test_a_state_file_never_leads_out_of_the_folder(tmp_path: Path) -> None:
 
 def test_keys_that_lerobot_does_not_have_are_pointed_out(tmp_path: Path) -> None:
     checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c", state_cond=True))
-    assert checkpoint.info()["notes"] == ["config.json has keys that Turbo-Pi doesn't know or follow: state_cond"]
+    assert checkpoint.info()["notes"] == [
+        "config.json has keys that Turbo-Pi doesn't know or follow: state_cond = True"
+    ]
+
+
+def test_keys_with_neutral_values_are_silent(tmp_path: Path) -> None:
+    """All that LeRobot's main branch writes beside 0.6.1's keys."""
+    newer: dict[str, Any] = {
+        "use_visual_memory": False,
+        "use_proprioceptive_memory": False,
+        "rtc_training_max_delay": 0,
+    }
+    newer |= {"memory_frames": 6, "memory_stride": 30, "memory_temporal_attention_every": 4}
+    assert open_checkpoint(lerobot_copy(tmp_path / "c", **newer)).info()["notes"] == []
+
+
+def test_keys_within_rtc_config_are_judged_too(tmp_path: Path) -> None:
+    rtc = {"enabled": True, "mode": "trained", "debug": True, "debug_maxlen": 100, "blend": 0.5}
+    unknown, trained = open_checkpoint(lerobot_copy(tmp_path / "c", rtc_config=rtc)).info()["notes"]
+    assert unknown.endswith("follow: rtc_config.blend = 0.5")
+    assert 'says mode "trained"' in trained and '"rtc_trained"' in trained
+
+
+STORED: list[Callable[[torch.Tensor], torch.Tensor]] = [
+    lambda tensor: tensor.bfloat16(),
+    lambda tensor: tensor.half(),
+    lambda tensor: tensor.double(),
+    lambda tensor: tensor[None],
+    lambda tensor: tensor[None].bfloat16(),
+]
+
+
+def rewrite_statistics(folder: Path, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    for file in set(folder.glob("*.safetensors")) - {folder / "model.safetensors"}:
+        kept = {
+            name: tensor for name, tensor in load_file(file).items() if name.startswith(("observation.state", "action"))
+        }
+        save_file({name: change(tensor).contiguous() for name, tensor in kept.items()}, file)
+
+
+@pytest.mark.parametrize("stored", STORED)
+def test_statistics_of_any_number_type_are_read_as_lerobot_broadcasts_them(
+    tmp_path: Path, stored: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    rewrite_statistics(folder, stored)
+    stats = open_checkpoint(folder).norm_stats
+    for feature, theirs in (("state", "observation.state"), ("actions", "action")):
+        for name in ("q01", "q99"):
+            expected = stored(lerobot_statistics()[f"{theirs}.{name}"]).double().reshape(-1).numpy()
+            assert np.array_equal(getattr(getattr(stats, feature), name), expected)
+
+
+def test_one_number_is_the_statistic_of_all_values_of_a_feature(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    rewrite_statistics(folder, lambda tensor: tensor[:1].to(torch.int32))
+    stats = open_checkpoint(folder).norm_stats
+    assert stats.state is not None and stats.actions is not None
+    assert (stats.state.dim, stats.actions.dim) == (8, 7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda tensor: torch.stack([tensor, tensor]),
+            r"observation\.state: mean is float32\[2, 8\]; expected numbers",
+        ),
+        (lambda tensor: tensor > 0, r"mean is bool\[8\]"),
+        (lambda tensor: tensor * torch.nan, "must be a list of finite numbers"),
+    ],
+)
+def test_statistics_that_scale_nothing_are_refused(tmp_path: Path, change: Any, message: str) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    rewrite_statistics(folder, change)
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+# -- the tokenizer that LeRobot's main branch saves beside the processors ----------------------------------------------
+
+
+def name_tokenizer(folder: Path, name: str, *, declared: bool) -> None:
+    entry = {"artifacts": {"tokenizer_name": name}} if declared else {}
+    edit_json(
+        folder / PRE,
+        lambda c: (
+            step(c, "tokenizer_processor").update(entry),
+            step(c, "tokenizer_processor")["config"].update(tokenizer_name=name),
+        ),
+    )
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_tokenizers_name_is_the_folder_beside_the_processors(tmp_path: Path, declared: bool) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    tokenizer_folder.write(folder / "tokenizer")
+    name_tokenizer(folder, "tokenizer", declared=declared)
+    checkpoint = open_checkpoint(folder)
+    assert checkpoint.named_tokenizer == folder / "tokenizer"
+    assert checkpoint.info()["notes"] == []
+
+
+def test_a_converted_checkpoint_keeps_the_tokenizer_that_was_named(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    name_tokenizer(folder, str(tokenizer_folder.write(tmp_path / "elsewhere")), declared=False)
+    convert(folder, tmp_path / "converted", precision="f32")
+    assert (
+        tmp_path / "converted" / "tokenizer" / "tokenizer.json"
+        in open_checkpoint(tmp_path / "converted").tokenizer_candidates
+    )
+
+
+def test_a_tokenizer_elsewhere_on_this_machine_is_the_one_that_is_there_whatever_it_is_called(tmp_path: Path) -> None:
+    folder, other = lerobot_copy(tmp_path / "c"), tokenizer_folder.write(tmp_path / "paligemma")
+    name_tokenizer(folder, str(other), declared=False)
+    assert open_checkpoint(folder).named_tokenizer == other
+    name_tokenizer(folder, "/models/paligemma", declared=False)  # not here
+    checkpoint = open_checkpoint(folder)
+    assert checkpoint.named_tokenizer is None
+    (note,) = checkpoint.info()["notes"]
+    assert "tokenises with /models/paligemma, which isn't here: PaliGemma's is taken for it" in note
+
+
+def test_a_declared_tokenizer_that_is_missing_or_outside_is_refused(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    for name, message in (("tokenizer", "names the tokenizer tokenizer beside it"), ("../t", "which isn't in")):
+        name_tokenizer(folder, name, declared=True)
+        with pytest.raises(CheckpointError, match=message):
+            open_checkpoint(folder)
+
+
+def test_a_prompt_without_the_state_is_refused(tmp_path: Path) -> None:
+    """LeRobot's main branch may save so what it trains with proprioceptive memory."""
+    folder, name = lerobot_copy(tmp_path / "c"), "pi05_prepare_state_tokenizer_processor_step"
+    edit_json(folder / PRE, lambda c: step(c, name)["config"].update(include_state_in_prompt=True))
+    open_checkpoint(folder)
+    edit_json(folder / PRE, lambda c: step(c, name)["config"].update(include_state_in_prompt=False))
+    with pytest.raises(CheckpointError, match="include_state_in_prompt is false"):
+        open_checkpoint(folder)
 
 
 def test_tensors_are_named_with_lerobots_prefix(tmp_path: Path) -> None:

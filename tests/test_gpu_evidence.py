@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
-import gpu_evidence
-import machine_code
 import pytest
 import torch
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+import gpu_evidence
+import machine_code
 
 from turbopi import backends as registry
 from turbopi.kernels import nvrtc

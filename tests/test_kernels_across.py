@@ -9,6 +9,8 @@ from conftest import on_hopper
 from emulator import emulate
 from torch import Tensor
 
+pytest.importorskip("triton", reason="Triton isn't installed")
+
 from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS

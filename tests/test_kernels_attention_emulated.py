@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
-import machine_code
 import numpy as np
 import pytest
 import torch
@@ -15,6 +14,8 @@ from emulator.emulate import Machine
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
+
+import machine_code
 
 from turbopi.engine.packing import pack_rows
 from turbopi.errors import BackendUnavailable

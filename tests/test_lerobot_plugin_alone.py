@@ -132,6 +132,34 @@ def test_actions_come_one_by_one_until_n_action_steps_are_used(modeling: Any, ch
     torch.testing.assert_close(policy.select_action(batch(2), noise=noise), noise[:, 0, :7] + 4)
 
 
+def test_dropping_queued_actions_looks_at_the_next_observation(modeling: Any, checkpoint: Path) -> None:
+    """LeRobot's main branch calls it when the task changes within an episode."""
+    policy, model = made(modeling, checkpoint, n_action_steps=3)
+    policy.select_action(batch())
+    policy.drop_queued_actions()
+    policy.select_action(batch())
+    assert len(model.seen) == 2
+
+
+def test_what_is_saved_has_all_that_the_processors_name(modeling: Any, checkpoint: Path, tmp_path: Path) -> None:
+    (checkpoint / "tokenizer").mkdir()
+    (checkpoint / "tokenizer" / "tokenizer.json").write_text("{}")
+    file = checkpoint / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"][-1]["artifacts"] = {"tokenizer_name": "tokenizer"}
+    file.write_text(json.dumps(content))
+    policy, _ = made(modeling, checkpoint)
+    (tmp_path / "saved").mkdir()
+    policy._save_pretrained(tmp_path / "saved")
+    policy._save_pretrained(tmp_path / "saved")  # over what is there
+    assert (tmp_path / "saved" / "tokenizer" / "tokenizer.json").read_text() == "{}"
+    assert (tmp_path / "saved" / "policy_postprocessor.json").is_file()
+    content["steps"][-1]["artifacts"] = {"tokenizer_name": "../tokenizer"}
+    file.write_text(json.dumps(content))
+    with pytest.raises(CheckpointError, match="which isn't in"):
+        policy._save_pretrained(tmp_path / "saved")
+
+
 def test_training_is_refused(modeling: Any, checkpoint: Path) -> None:
     policy, _ = made(modeling, checkpoint)
     for call in (lambda: policy.forward(batch()), policy.get_optim_params, policy.config.get_optimizer_preset):

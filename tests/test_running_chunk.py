@@ -14,10 +14,12 @@ from test_begin import OnCpu
 from test_policy import golden_policy
 
 from turbopi import UnifiedPolicy, open_checkpoint
+from turbopi.backends.abilities import Held
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import RealTime
 from turbopi.errors import CheckpointError, ConfigError, ObservationError
+from turbopi.joining import Joining
 from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.model.denoise import time_grid
 from turbopi.running_chunk import RunningChunk
@@ -84,6 +86,43 @@ def test_the_policys_options_are_taken_where_the_chunk_says_nothing() -> None:
     assert completed(RunningChunk(rows(8), 7), options).execution_horizon == 3, "a long delay cuts it"
     own = completed(RunningChunk(rows(8), 2, 3, schedule="ones", max_guidance_weight=1.0), options)
     assert (own.execution_horizon, own.schedule, own.max_guidance_weight) == (3, "ones", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("end", "delay", "left", "expected"),
+    [
+        (6, 2, 8, [1, 1, 0.8, 0.6, 0.4, 0.2, 0, 0, 0, 0]),
+        (6, 7, 8, [1, 1, 1, 1, 1, 1, 0, 0, 0, 0]),  # a delay past the mask's end is cut to it
+        (4, 4, 4, [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]),
+        (9, 1, 3, [1, 2 / 3, 1 / 3, 0, 0, 0, 0, 0, 0, 0]),  # the left-over ends first
+        (10, 0, 4, [0.8, 0.6, 0.4, 0.2, 0, 0, 0, 0, 0, 0]),  # as long as the chunk or longer: the left-over ends it
+        (10, 9, 10, [1, 1, 1, 1, 1, 1, 1, 1, 1, 0.5]),
+    ],
+)
+def test_identity_without_an_execution_horizon_has_lerobots_mask(
+    end: int, delay: int, left: int, expected: list[float]
+) -> None:
+    """LeRobot's execution_horizon is the mask's end e, which a checkpoint's options hold as s = H − e, or None."""
+    options = RealTime(execution_horizon=H - end if end < H else None, schedule="linear", max_guidance_weight=10.0)
+    asked = conditioning(RunningChunk(rows(left), delay, mode="rtc_identity"), options).guidance
+    assert asked is not None
+    np.testing.assert_allclose(asked.weights, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("horizon", "s"), [(8, 2), (10, 4), (12, 6), (5, 1)])
+def test_identitys_mask_ends_where_it_does_in_chunks_of_another_length(
+    policy: UnifiedPolicy, horizon: int, s: int
+) -> None:
+    """Of a policy whose mask ends at 6; a shorter chunk's ends with the left-over of 4."""
+    config = dataclasses.replace(policy.config, real_time=RealTime(execution_horizon=H - 6))
+    joining = Joining(config, policy._pipeline, Held(lambda: policy.backend))
+    ((_, chunk),) = joining.checked([None], [RunningChunk(rows(4), 1, mode="rtc_identity")], 2, horizon).rows
+    assert chunk is not None and chunk.execution_horizon == s
+
+
+def test_identity_with_an_execution_horizon_of_its_own_needs_room_for_the_delay() -> None:
+    with pytest.raises(ObservationError, match="a delay of 4 and an execution horizon of 7 don't fit a chunk of 10"):
+        completed(RunningChunk(rows(8), 4, 7, mode="rtc_identity"))
 
 
 def test_trained_mode_holds_what_will_be_carried_out() -> None:

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import sentencepiece
+from hypothesis import given
+from hypothesis import strategies as st
+from lerobot_cases import tokenizer_folder
 
 import turbopi
 from turbopi.config import preset
@@ -136,10 +139,10 @@ def test_two_tokenizers_of_a_checkpoint_that_differ_are_warned_of(
     for file in (tmp_path / "tokenizer.model", tmp_path / "assets" / "tokenizer.model"):
         shutil.copyfile(TINY_TOKENIZER, file)
     load_tokenizer(checkpoint_dir=tmp_path, vocab_size=TINY_VOCAB)
-    assert "two sources" not in caplog.text
+    assert not caplog.text
     file.write_bytes(b"another")
     assert load_tokenizer(checkpoint_dir=tmp_path, vocab_size=TINY_VOCAB).source == str(tmp_path / "tokenizer.model")
-    assert f"{tmp_path / 'tokenizer.model'} is read, and {file} differs" in caplog.text
+    assert f"{tmp_path / 'tokenizer.model'} isn't compared" in caplog.text and f"{file} isn't a" in caplog.text
 
 
 def test_without_a_tokenizer_the_error_says_where_to_get_it(tmp_path: Path, no_cache: Path) -> None:
@@ -165,7 +168,9 @@ def test_a_given_path_is_the_only_place(tmp_path: Path, no_cache: Path) -> None:
     with pytest.raises(TokenizerError, match=r"there is no tokenizer at .*absent\.model"):
         load_tokenizer(tmp_path / "absent.model", vocab_size=TINY_VOCAB)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(TokenizerError, match=r"empty holds no tokenizer\.model or paligemma_tokenizer\.model"):
+    with pytest.raises(
+        TokenizerError, match=r"empty holds no tokenizer\.model, paligemma_tokenizer\.model or tokenizer\.json"
+    ):
         load_tokenizer(tmp_path / "empty", vocab_size=TINY_VOCAB)
 
 
@@ -245,3 +250,119 @@ def test_the_newline_behind_a_prompt_is_encoded_once() -> None:
     ids = [prompts.encode(prompt) for prompt in ("open", "close")]
     assert encoder.calls == [["open", True], ["\n", False], ["close", True]]
     assert ids == [[*encoder.encode(prompt, True), *encoder.encode("\n", False)] for prompt in ("open", "close")]
+
+
+# transformers' tokenizer.json
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What transformers would save of our small tokenizer."""
+    return tokenizer_folder.write(tmp_path_factory.mktemp("tokenizers") / "tokenizer")
+
+
+@pytest.fixture(scope="module")
+def from_json(folder: Path) -> PromptTokenizer:
+    return load_tokenizer(folder / "tokenizer.json", vocab_size=TINY_VOCAB)
+
+
+@given(st.text(st.sampled_from("▁ \n\t_aehkotéλ🙂<0x1>;:-9"), max_size=60) | st.text(max_size=30))
+def test_a_tokenizer_json_gives_the_ids_of_the_model_that_it_came_from(from_json: PromptTokenizer, text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return
+    assert from_json.encoder.encode(text, add_bos=True) == tiny().encoder.encode(text, add_bos=True)
+
+
+def test_text_that_names_a_special_piece_is_that_piece_as_in_transformers(from_json: PromptTokenizer) -> None:
+    assert from_json.encoder.encode("<s>a", add_bos=False)[0] == 2 != tiny().encoder.encode("<s>a", add_bos=False)[0]
+
+
+def test_the_folder_that_a_checkpoint_names_comes_before_other_places(
+    folder: Path, tmp_path: Path, no_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    no_cache.parent.mkdir(parents=True)
+    no_cache.write_bytes(TINY_TOKENIZER.read_bytes())
+    found = load_tokenizer(checkpoint_dir=tmp_path, named=folder, candidates=[TINY_TOKENIZER], vocab_size=TINY_VOCAB)
+    assert found.source == str(folder / "tokenizer.json")
+    given = load_tokenizer(TINY_TOKENIZER, named=folder, vocab_size=TINY_VOCAB)  # it wins, and has the same pieces
+    assert given.source == str(TINY_TOKENIZER) and not caplog.text
+
+
+def changed_folder(folder: Path, change: Any) -> Path:
+    content = tokenizer_folder.tokenizer_json()
+    change(content)
+    folder.mkdir()
+    (folder / "tokenizer.json").write_text(json.dumps(content))
+    return folder
+
+
+def swap_pieces(content: Any) -> None:
+    vocab = content["model"]["vocab"]
+    vocab["a"], vocab["b"] = vocab["b"], vocab["a"]
+
+
+def test_a_given_tokenizer_with_other_pieces_than_the_checkpoints_is_warned_about(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = changed_folder(tmp_path / "other", swap_pieces)
+    assert load_tokenizer(TINY_TOKENIZER, named=other, vocab_size=TINY_VOCAB).source == str(TINY_TOKENIZER)
+    assert "isn't the checkpoint's own" in caplog.text and "is 'b' there and 'a' here" in caplog.text
+
+
+def test_a_named_tokenizer_that_cannot_be_read_is_never_replaced_in_silence(
+    tmp_path: Path, no_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    no_cache.parent.mkdir(parents=True)
+    no_cache.write_bytes(TINY_TOKENIZER.read_bytes())
+    (tmp_path / "tokenizer").mkdir()
+    with pytest.raises(TokenizerError, match=r"names the tokenizer in .*, which holds no tokenizer\.json or"):
+        load_tokenizer(named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)
+    (tmp_path / "tokenizer" / "tokenizer.json").write_text("{}")
+    with pytest.raises(TokenizerError, match=r"tokenizer\.json: model is None; Turbo-Pi reads the byte-pair"):
+        load_tokenizer(named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)
+    load_tokenizer(TINY_TOKENIZER, named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)  # given: it wins
+    assert "isn't compared with the checkpoint's own" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["model"].update(type="Unigram"), r"model\.type is Unigram"),
+        (lambda c: c["model"].update(byte_fallback=False), r"model\.byte_fallback is False"),
+        (lambda c: c["model"].update(merges=c["model"]["merges"][:-1]), "all merges that the vocabulary allows"),
+        (lambda c: c["model"]["merges"].append(c["model"]["merges"][0]), "merges in the order of the pieces"),
+        (lambda c: c["model"]["merges"].append(["a", "?!"]), "merges of the vocabulary's pieces"),
+        (lambda c: c["model"]["merges"].append(3), r"model\.merges is a list with 3"),
+        (lambda c: c["model"]["vocab"].update({"a": 5}), "pieces with an id each, from 0 on"),
+        (lambda c: c.update(normalizer={"type": "NFKC"}), "normalizer is .*a ▁ for each blank"),
+        (lambda c: c.update(pre_tokenizer={"type": "ByteLevel"}), "pre_tokenizer is .*splits at blanks"),
+        (lambda c: c.update(post_processor=None), "a beginning-of-sequence piece before the text"),
+        (lambda c: c["post_processor"]["single"].append(c["post_processor"]["single"][0]), "post_processor is"),
+        (lambda c: c["added_tokens"][0].update(lstrip=True), "texts that are found as they are"),
+        (lambda c: c["added_tokens"][0].update(id=7), "one piece for each id"),
+    ],
+)
+def test_a_tokenizer_json_that_is_not_gemmas_is_refused_by_what_it_says(
+    tmp_path: Path, change: Any, message: str
+) -> None:
+    with pytest.raises(TokenizerError, match=message):
+        load_tokenizer(changed_folder(tmp_path / "odd", change), vocab_size=TINY_VOCAB)
+
+
+@pytest.mark.parametrize(("key", "value"), [("tokenizer_class", "LlamaTokenizer"), ("add_bos_token", False)])
+def test_what_stands_beside_a_tokenizer_json_counts(tmp_path: Path, key: str, value: object) -> None:
+    folder = tokenizer_folder.write(tmp_path / "t")
+    config = tokenizer_folder.tokenizer_config() | {key: value}
+    (folder / "tokenizer_config.json").write_text(json.dumps(config))
+    with pytest.raises(TokenizerError, match=f"tokenizer_config.json's {key} is"):
+        load_tokenizer(folder, vocab_size=TINY_VOCAB)
+
+
+def test_merges_written_as_text_are_the_same(folder: Path, tmp_path: Path, from_json: PromptTokenizer) -> None:
+    text = changed_folder(
+        tmp_path / "t", lambda c: c["model"].update(merges=[" ".join(m) for m in c["model"]["merges"]])
+    )
+    found = load_tokenizer(text, vocab_size=TINY_VOCAB)
+    assert found.encode("pick up the black bowl") == from_json.encode("pick up the black bowl")

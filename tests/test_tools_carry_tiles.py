@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-from machine_code import compiler
 from msgspec.structs import replace
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from carry_tiles import carried, compiled, forms, other_sources
+from machine_code import compiler
 
 from turbopi.backends.tuned_tiles import PACKAGE, SHIPPED, TileFile, fingerprint, read_tile_file
 from turbopi.kernels.sm90.gemm.bf16 import EPILOGUES, Tile

@@ -120,6 +120,9 @@ class Joining:
             self._check_form(conditioning.form)
         if previous is not None:
             relative, options = self._pipeline.robot.delta_mask is not None, self._config.real_time
+            if previous.mode == "rtc_identity" and options.execution_horizon is not None:
+                end = self._model.action_horizon - options.execution_horizon  # LeRobot's, whatever the call's horizon
+                options = replace(options, execution_horizon=horizon - end if end < horizon else None)
             previous = previous.completed(horizon, self._model.action_dim, relative=relative, options=options)
             self._check_form(FORMS[previous.mode])
         return conditioning, previous

@@ -113,6 +113,7 @@ class UnifiedPolicy:
         prompt_tokenizer = load_tokenizer(
             tokenizer,
             checkpoint_dir=checkpoint.path,
+            named=checkpoint.named_tokenizer,
             candidates=checkpoint.tokenizer_candidates,
             vocab_size=checkpoint.config.model.vocab_size,
         )

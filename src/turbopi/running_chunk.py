@@ -24,7 +24,8 @@ class RunningChunk:
     delay              d, control steps: how many of these actions will be carried out before the new chunk arrives
     execution_horizon  s, control steps: how many actions of a chunk are carried out before the next takes over. Guided
                        modes pull towards the left-over before H − s; d ≤ H − s. None: the policy's, cut to H − d, or
-                       where it has none the whole left-over: max(H − K, d, 1)
+                       where it has none the whole left-over: max(H − K, d, 1). With "rtc_identity" None is as in
+                       LeRobot, whose mask ends at e = H − s of the policy's s, or at K: the delay is cut to it
     mode               "rtc": guided, with the true Jacobian (arXiv 2506.07339). "rtc_identity": guided as LeRobot 0.6
                        computes it. "rtc_trained": the first d actions are held (arXiv 2512.05964), for checkpoints
                        that were trained so
@@ -71,11 +72,15 @@ class RunningChunk:
             )
         if self.mode == "rtc_trained":
             self._check_trained(delay, options.trained_max_delay)
-        if s is None and self.mode != "rtc_trained" and options.execution_horizon is not None:
+        if self.mode == "rtc_trained":
+            s = 1 if s is None else s
+        elif self.mode == "rtc_identity" and s is None:
+            s = horizon - rows if options.execution_horizon is None else min(options.execution_horizon, horizon)
+        elif s is None and options.execution_horizon is not None:
             s = max(1, min(options.execution_horizon, horizon - delay))
-        if s is None:
-            s = 1 if self.mode == "rtc_trained" else max(horizon - rows, delay, 1)
-        if delay > horizon - s:
+        elif s is None:
+            s = max(horizon - rows, delay, 1)
+        if delay > horizon - s and not (self.mode == "rtc_identity" and given is None):
             raise ObservationError(
                 f"a delay of {delay} and an execution horizon of {s} don't fit a chunk of {horizon} actions: together "
                 f"they should be at most {horizon}. Carry out fewer actions of a chunk, or take a larger horizon"
@@ -101,7 +106,13 @@ class RunningChunk:
         left_over  the chunk's, for relative actions moved to the new state
         time_grid  as `ModelConfig`'s
         """
-        from turbopi.model.conditioning import Conditioning, Guidance, guidance_strength, guidance_weights
+        from turbopi.model.conditioning import (
+            Conditioning,
+            Guidance,
+            guidance_strength,
+            guidance_weights,
+            lerobot_guidance_weights,
+        )
 
         assert self.execution_horizon is not None and self.schedule is not None and self.max_guidance_weight is not None
         target = np.zeros((horizon, left_over.shape[1]), np.float32)
@@ -110,14 +121,14 @@ class RunningChunk:
             held = np.arange(horizon) < self.delay
             return Conditioning(held=held, values=target) if self.delay else Conditioning()
         times = Conditioning().token_times(num_steps, horizon, time_grid).times
-        s = max(self.execution_horizon, horizon - len(left_over))  # nothing pulls towards what isn't there
+        rows, s = len(left_over), self.execution_horizon
+        if self.mode == "rtc":  # nothing pulls towards what isn't there
+            weights = guidance_weights(horizon, self.delay, max(s, horizon - rows), self.schedule)
+        else:
+            weights = lerobot_guidance_weights(horizon, self.delay, horizon - s, rows, self.schedule)
+        strength = guidance_strength(times, self.max_guidance_weight)
         return Conditioning(
-            guidance=Guidance(
-                target,
-                guidance_weights(horizon, self.delay, s, self.schedule),
-                guidance_strength(times, self.max_guidance_weight),
-                "jacobian" if self.mode == "rtc" else "identity",
-            )
+            guidance=Guidance(target, weights, strength, "jacobian" if self.mode == "rtc" else "identity")
         )
 
     def _checked_left_over(self, horizon: int, action_dim: int) -> np.ndarray:

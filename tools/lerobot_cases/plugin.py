@@ -9,7 +9,8 @@ It gets plugin.npz, everything by LeRobot's processors, loaded as its commands l
     {run}/actions            the plugin's chunk from the stored noise, float32 [H, d], un-normalised
     selected_actions         the plugin's, one by one from select_action, the stored noise for each chunk
     seeded, lerobot_seeded   a chunk with the noise that PyTorch's seed 3 gives, the plugin's and LeRobot's own:
-                             the latter not for adapters, nor for cases of other sizes than small.py's (0.4's)
+                             the latter not for adapters, nor for cases of other sizes than small.py's, which LeRobot
+                             would load in silence as far as names and sizes agree
     bf16, lerobot_bf16       the seeded ones in bfloat16, both or neither
     loaded_again             the first run's, by a policy that was saved and loaded again
 """
@@ -27,7 +28,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot_policy_turbopi import TurboPiConfig
 
-from lerobot_cases.small import shrink
+from lerobot_cases.small import VISION_HEADS, shrink
 
 
 def run(folder: Path) -> dict[str, np.ndarray]:
@@ -47,7 +48,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     torch.manual_seed(3)
     found["seeded"] = post(policy.predict_action_chunk(pre(_request(inputs, 0))))[0]
     own = PreTrainedConfig.from_pretrained(checkpoint)
-    if not own.use_peft and not case["versions"]["lerobot"].startswith("0.4"):
+    if not own.use_peft and case["vision_heads"] == VISION_HEADS:
         own.pretrained_path = checkpoint
         config = TurboPiConfig(checkpoint=str(checkpoint), backend="pytorch", device="cpu")
         for name, one in (("lerobot_seeded", own), ("lerobot_bf16", replace(own, dtype="bfloat16")), ("bf16", config)):

@@ -16,6 +16,8 @@ from lerobot.policies.pi05 import modeling_pi05
 from lerobot.processor import tokenizer_processor
 from sentencepiece import SentencePieceProcessor
 
+from lerobot_cases import tokenizer_folder
+
 TOKENIZER = Path(__file__).parents[2] / "src" / "turbopi" / "data" / "small_policy" / "tokenizer.model"
 VISION = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2}
 VISION_HEADS = VISION["num_attention_heads"]
@@ -52,8 +54,12 @@ class _SmallTokenizer:
 
     @classmethod
     def from_pretrained(cls, name: str, **_: Any) -> "_SmallTokenizer":
-        assert "paligemma" in name, name
+        assert "paligemma" in name or Path(name).is_dir(), name
         return cls()
+
+    def save_pretrained(self, folder: Path) -> None:
+        """LeRobot saves the tokenizer beside the processors after 0.6.1."""
+        tokenizer_folder.write(folder)
 
     def __call__(
         self,

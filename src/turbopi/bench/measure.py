@@ -75,6 +75,7 @@ def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None
     found = load_tokenizer(
         TINY_TOKENIZER if tokenizer is None and checkpoint.format == "random" else tokenizer,
         checkpoint_dir=checkpoint.path,
+        named=checkpoint.named_tokenizer,
         candidates=checkpoint.tokenizer_candidates,
         vocab_size=checkpoint.config.model.vocab_size,
     )

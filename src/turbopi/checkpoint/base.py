@@ -64,6 +64,7 @@ class Checkpoint:
     source: WeightSource
     asset_id: str | None = None
     tokenizer_candidates: tuple[Path, ...] = ()
+    named_tokenizer: Path | None = None  # the folder that LeRobot's processors name, if it is here
     expected_sha256: str | None = None  # what the configuration says the weights' hash is
 
     @property

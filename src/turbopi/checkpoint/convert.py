@@ -151,6 +151,11 @@ def write_beside(checkpoint: Checkpoint, folder: Path) -> None:
         copy = folder / (file.relative_to(checkpoint.path) if checkpoint.path else file.name)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, copy)
+    if checkpoint.named_tokenizer is not None:
+        (folder / "tokenizer").mkdir(exist_ok=True)
+        for name in ("tokenizer.json", "tokenizer_config.json", "tokenizer.model"):
+            if (checkpoint.named_tokenizer / name).is_file():
+                shutil.copyfile(checkpoint.named_tokenizer / name, folder / "tokenizer" / name)
     if checkpoint.norm_stats.state is not None or checkpoint.norm_stats.actions is not None:
         file = folder / "assets" / asset_id / NORM_STATS
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -10,9 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load_file
+from safetensors.torch import load_file
+from torch import Tensor
 
+from turbopi.checkpoint import lerobot_keys as keys
 from turbopi.checkpoint import lerobot_versions as versions
 from turbopi.checkpoint.lerobot_pipeline import (
     ACTION,
@@ -46,14 +50,6 @@ _CHOICES = {  # LeRobot refuses any other value of these; what counts here are t
     "action_expert_variant": _VARIANTS,
     "dtype": ("bfloat16", "float32"),
 }
-# values of config.json that change what the model computes, and the only ones that Turbo-Pi computes
-_FIXED = {
-    "image_resolution": ([224, 224], "224 x 224 pictures"),
-    "min_period": (4e-3, "the time embedding's shortest period 0.004"),
-    "max_period": (4.0, "the time embedding's longest period 4.0"),
-}
-# every key that LeRobot writes: read here, not used by Pi0.5 and Pi0 (n_obs_steps), or about training and the hub
-_KNOWN = versions.FIRST_KEYS | versions.LATER_KEYS
 
 
 class LeRobotFolder:
@@ -122,18 +118,16 @@ class LeRobotFolder:
         return self.stats
 
     def notes(self) -> list[str]:
-        """Where the files say two things or what isn't done, and what is done then; keys that LeRobot doesn't have,
-        from which another program may compute something.
-        """
+        """Where the files say two things or what isn't done, and what is done then; keys that nobody here knows."""
         notes = []
-        unknown = sorted(self.config.values.keys() - _KNOWN)
-        if unknown:
+        if unknown := keys.unknown(self.config.values):
             notes.append(f"{CONFIG} has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}")
         if self._rtc_config is not None:
-            notes.append(
-                f"{CONFIG} enables rtc_config: its schedule, weight and horizon are what `infer(previous=…)` takes "
-                "where it is told nothing else (docs/real_time.md); a call without it is an ordinary one"
-            )
+            what = "enables rtc_config: `infer(previous=…)` takes its schedule, weight and horizon where it has none"
+            if self._rtc_config.choice("mode", ("guided", "trained"), default="guided") == "trained":
+                what = 'says mode "trained": give `infer` a running chunk of mode "rtc_trained"'
+            notes.append(f"{CONFIG} {what} (docs/real_time.md); a call without one is an ordinary one")
+        notes += self.pipelines.notes
         if self.settings.policy is not None:
             return notes
         if self.settings.values.get("lerobot_semantics", "auto") == "auto" and self.written_by != "0.6":
@@ -184,12 +178,12 @@ class LeRobotFolder:
         for key, choices in _CHOICES.items():
             if self.config.values.get(key) is not None:
                 self.config.choice(key, choices)
-        for key, (expected, meaning) in _FIXED.items():
-            value = self.config.values.get(key, expected)
-            if value != expected:
-                raise CheckpointError(
-                    f"{self.file} has {key} = {shown(value)}, which Turbo-Pi doesn't compute; it does {meaning}"
-                )
+        if (refused := keys.refused(self.config.values)) is not None:
+            key, meaning = refused
+            raise CheckpointError(
+                f"{self.file} has {key} = {shown(self.config.values[key])}, which Turbo-Pi doesn't compute; it does "
+                f"{meaning}. Run this checkpoint with LeRobot's own policy"
+            )
         return cast(Kind, kind)
 
     @property
@@ -277,8 +271,27 @@ class LeRobotFolder:
         applied = feature in step.config.object("features", {}).values and (selected is None or feature in selected)
         if feature == STATE and not applied:  # LeRobot then passes the state through, whatever statistics there are
             return None, f"{file} (the {name}'s features leave out {STATE})"
-        values = {key: tensors[f"{feature}.{key}"] for key in STATISTICS if f"{feature}.{key}" in tensors}
-        return (feature_stats(values, f"{file}: {feature}") if values else None), str(file)
+        found = {key: tensors[f"{feature}.{key}"] for key in STATISTICS if f"{feature}.{key}" in tensors}
+        return (self._spread(found, feature, file) if found else None), str(file)
+
+    def _spread(self, found: Mapping[str, Tensor], feature: str, file: Path) -> FeatureStats:
+        """Statistics of any dtype, as wide as their feature: LeRobot makes all of them float32 and broadcasts them."""
+        where = f"{file}: {feature}"
+        rows: dict[str, np.ndarray] = {}
+        for name, tensor in found.items():
+            if tensor.dtype == torch.bool or tensor.is_complex() or any(size != 1 for size in tensor.shape[:-1]):
+                raise CheckpointError(
+                    f"{where}: {name} is {str(tensor.dtype).removeprefix('torch.')}{list(tensor.shape)}; expected "
+                    "numbers, one for each value of the feature"
+                )
+            rows[name] = tensor.to(torch.float64).reshape(-1).numpy()
+        width = max(len(row) for row in rows.values())
+        if width == 1:  # one number for all of the feature
+            features = {STATE: ("input_features", "max_state_dim"), ACTION: ("output_features", "max_action_dim")}
+            listed, otherwise = features[feature]
+            width = self._width(listed, feature, otherwise)
+        spread = {name: np.repeat(row, width) if len(row) == 1 else row for name, row in rows.items()}
+        return feature_stats(spread, where)
 
     # -- the robot -----------------------------------------------------------------------------------------------------
 

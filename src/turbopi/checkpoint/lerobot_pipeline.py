@@ -30,12 +30,14 @@ strips the prompt.
 Sources: LeRobot 0.4.0 to 0.6.1, `processor/`, `policies/pi0/processor_pi0.py` and `policies/pi05/processor_pi05.py`.
 """
 
+import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from turbopi.config import LIMITS, Kind
 from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, read_json, shown
+from turbopi.reading import Fields, file_inside, read_json, shown
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."
@@ -59,7 +61,7 @@ _STEPS: dict[str, dict[str, tuple[str, ...]]] = {
         RENAME: ("rename_map",),
         RELATIVE: ("enabled", "exclude_joints", "action_names"),
         NORMALIZER: _SCALING,
-        STATE_STEP: ("max_state_dim", "task_key"),
+        STATE_STEP: ("max_state_dim", "task_key", "include_state_in_prompt"),
         TOKENIZER: ("tokenizer_name", "max_length", "task_key", "padding", "padding_side", "truncation"),
         **_HARMLESS,
         **dict.fromkeys(_NEW_LINES, ()),
@@ -82,6 +84,7 @@ class Step:
     config: Fields
     file: Path  # that lists it
     state_file: str | None  # of its tensors, beside `file`
+    artifacts: Fields  # what LeRobot saved beside `file` for values of config: after 0.6.1 alone
 
 
 class Pipelines:
@@ -91,18 +94,29 @@ class Pipelines:
     steps           the steps that compute something, by name
     rename_map      observations' names -> the policy's
     max_tokens      of a prompt
+    tokenizer       the folder that the tokenizer's name points to, in the checkpoint or elsewhere on this machine.
+                    None: it is PaliGemma's, by its name
+    notes           what isn't sure about them
     prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
                     0 for Pi0, which writes none
     """
 
     def __init__(self, folder: Path, kind: Kind = "pi05") -> None:
+        self.notes: list[str] = []
         self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind)}
         self.rename_map = self._rename_map()
         self._check_task_keys()
         self.max_tokens = self._tokenizer()
+        self.tokenizer = self._named_tokenizer(folder)
         self.prompt_width = 0
         if kind == "pi05":
-            self.prompt_width = self.steps[STATE_STEP].config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
+            state_step = self.steps[STATE_STEP]
+            self.prompt_width = state_step.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
+            if not state_step.config.flag("include_state_in_prompt", True):
+                raise CheckpointError(
+                    f"{state_step.file}: include_state_in_prompt is false, as for proprioceptive memory; Turbo-Pi "
+                    "writes the state into Pi0.5's prompt"
+                )
 
     def relative_mask(self, action_dim: int) -> list[bool] | None:
         """Which of the actions are relative to the state when they leave the model, and absolute in the answer.
@@ -158,9 +172,6 @@ class Pipelines:
 
     def _tokenizer(self) -> int:
         step = self.steps[TOKENIZER]
-        name = step.config.text("tokenizer_name", PALIGEMMA)
-        if "paligemma" not in name.lower():
-            raise CheckpointError(f"{step.file} tokenises with {name}; expected {PALIGEMMA}")
         if not step.config.flag("truncation", True):
             raise CheckpointError(
                 f"{step.file}: truncation is false, so LeRobot's prompts may be longer than max_length; Turbo-Pi cuts "
@@ -170,6 +181,30 @@ class Pipelines:
         step.config.choice("padding", ("max_length", "longest"), "max_length")
         step.config.choice("padding_side", ("right", "left"), "right")
         return step.config.integer("max_length", 1, LIMITS["max_prompt_tokens"], default=512)  # LeRobot's own default
+
+    def _named_tokenizer(self, folder: Path) -> Path | None:
+        """What the tokenizer's name points to, not what it is called: after 0.6.1 LeRobot saves the tokenizer, too."""
+        step = self.steps[TOKENIZER]
+        if "tokenizer_name" in step.artifacts.values:
+            named = file_inside(folder, step.artifacts.values["tokenizer_name"], step.file)
+            if not named.is_dir():
+                raise CheckpointError(
+                    f"{step.file} names the tokenizer {named.relative_to(folder)} beside it, which isn't there; is the "
+                    "download complete?"
+                )
+            return named
+        name = step.config.text("tokenizer_name", PALIGEMMA)
+        inside = folder / name  # an absolute name stays as it is
+        if ".." not in Path(name).parts and os.path.isdir(inside):  # a name is any text: Path.is_dir may raise
+            return inside
+        if "paligemma" not in name.lower():
+            raise CheckpointError(
+                f"{step.file} tokenises with {name}; expected {PALIGEMMA}, or the name of a folder beside it that has "
+                "the tokenizer"
+            )
+        if not re.fullmatch(r"(google/)?paligemma[\w.-]*", name):
+            self.notes.append(f"{step.file.name} tokenises with {name}, which isn't here: PaliGemma's is taken for it")
+        return None
 
 
 def _read(file: Path, kind: Kind) -> list[Step]:
@@ -219,8 +254,9 @@ def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
         )
     if config.values.get("float_dtype") not in _SAME_NUMBERS:
         config.refuse("float_dtype", "null or float32: Turbo-Pi rounds neither observations nor actions to others")
-    state_file = None if "state_file" not in entry else Fields(entry, file).text("state_file")
-    return Step(name, config, file, state_file)
+    fields = Fields(entry, file)
+    state_file = None if "state_file" not in entry else fields.text("state_file")
+    return Step(name, config, file, state_file, Fields(fields.object("artifacts", {}).values, file))
 
 
 def _list_or_null(step: Step, key: str) -> list[object]:

@@ -30,13 +30,6 @@ FIRST_KEYS = frozenset(
         *("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"),
     }
 )
-LATER_KEYS = frozenset(
-    {
-        *("rtc_config", "use_peft", "freeze_vision_encoder", "train_expert_only", "use_relative_actions"),
-        *("relative_exclude_joints", "action_feature_names", "pretrained_revision", "optimizer_fused"),
-        *("rtc_training_max_delay",),
-    }
-)
 
 
 def detect(keys: Collection[str], *, untied: bool) -> Semantics | None:

@@ -63,8 +63,8 @@ def locate(path: str | Path) -> Location:
 
 
 def tokenizer_candidates(folder: Path) -> list[Path]:
-    """SentencePiece models in or below a checkpoint's folder (params/ and hidden ones aside), nearest first."""
-    patterns = ("*.model", "assets/*.model", "tokenizer/*.model", "big_vision/*.model")
+    """Tokenizers in or below a checkpoint's folder (params/ and hidden ones aside), nearest first."""
+    patterns = ("*.model", "assets/*.model", "tokenizer/*.model", "big_vision/*.model", "tokenizer/tokenizer.json")
     found = [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
     return [file for file in found if not file.name.startswith(".")]
 

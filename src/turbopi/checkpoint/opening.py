@@ -162,6 +162,7 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         expected_sha256=settings.weights_sha256,
         source=source,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
+        named_tokenizer=folder.pipelines.tokenizer,
     )
 
 

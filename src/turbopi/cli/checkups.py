@@ -175,6 +175,7 @@ def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
             given,
             vocab_size=vocab_size,
             checkpoint_dir=None if checkpoint is None else checkpoint.path,
+            named=None if checkpoint is None else checkpoint.named_tokenizer,
             candidates=() if checkpoint is None else checkpoint.tokenizer_candidates,
         )
     except TurboPiError as error:

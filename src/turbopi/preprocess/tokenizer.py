@@ -5,7 +5,6 @@ task alone, followed by a newline that is encoded by itself. Source: openpi's `t
 Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcessor`).
 """
 
-import filecmp
 import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ import sentencepiece
 
 from turbopi.errors import ObservationError, TokenizerError
 from turbopi.files import openpi_cache
+from turbopi.preprocess.tokenizer_json import TOKENIZER_JSON, TokenizerJson, differing_piece
 from turbopi.reading import read_bytes, shown
 
 logger = logging.getLogger(__name__)
@@ -136,33 +136,46 @@ def load_tokenizer(
     *,
     vocab_size: int,
     checkpoint_dir: str | Path | None = None,
+    named: Path | None = None,
     candidates: Iterable[str | Path] = (),
 ) -> PromptTokenizer:
-    """The tokenizer from the first of: `source`; `checkpoint_dir`; `candidates`; openpi's cache.
+    """The tokenizer from the first of: `source`; `checkpoint_dir`; `named`; `candidates`; openpi's cache.
 
-    source          a SentencePiece file, a folder that holds one, or an object with `encode(text, add_bos=...)`
+    source          a SentencePiece file, a tokenizer.json of Gemma's kind, a folder that holds one of them, or an
+                    object with `encode(text, add_bos=...)`
     vocab_size      of the model
     checkpoint_dir  searched, with its assets/, for tokenizer.model and paligemma_tokenizer.model
+    named           the folder of the tokenizer that a LeRobot checkpoint's processors name. One from another place is
+                    compared with it: a warning is logged where they differ
     candidates      further files
     openpi's cache  $OPENPI_DATA_HOME/big_vision/paligemma_tokenizer.model; ~/.cache/openpi if that isn't set
 
-    Raises TokenizerError if there is none (saying where to get it), if it isn't a SentencePiece model, or if it has
-    more pieces than the model. A given `source` is the only place looked at.
+    Raises TokenizerError if there is none (saying where to get it), if the first one can't be read, or if it has more
+    pieces than the model. A given `source` is the only place looked at.
     """
     if source is not None and not isinstance(source, str | Path):
         if not callable(getattr(source, "encode", None)):
             raise TokenizerError(f"tokenizer {source!r} has no encode(text, add_bos) method")
         return PromptTokenizer(source, vocab_size=vocab_size, source=type(source).__name__)
-    if source is not None:
-        return _open(_given_file(Path(source).expanduser()), vocab_size)
-    places = _places(checkpoint_dir, candidates)
-    there = [path for path in places if path.is_file()]
+    own = [] if named is None else [named / TOKENIZER_JSON, named / FILE_NAMES[0]]  # in transformers' order
+    places = _places(checkpoint_dir, [*own, *candidates])
+    if source is None:
+        there = [path for path in places if path.is_file()]
+    else:
+        there = [_given_file(Path(source).expanduser()), *(path for path in own if path.is_file())]
+    in_checkpoint = there[0] if there and there[0] != cached_tokenizer() else None
+    if own and in_checkpoint is None:
+        raise TokenizerError(
+            f"the checkpoint names the tokenizer in {named}, which holds no {TOKENIZER_JSON} or {FILE_NAMES[0]}; "
+            "is the download complete? Or give tokenizer="
+        )
     if not there:
         raise TokenizerError(_not_found(places))
+    found = _open(there[0], vocab_size)
     for other in there[1:]:
-        if other != cached_tokenizer() and not filecmp.cmp(there[0], other, shallow=False):
-            logger.warning("two sources of the tokenizer: %s is read, and %s differs", there[0], other)
-    return _open(there[0], vocab_size)
+        if other != cached_tokenizer() and not other.samefile(there[0]):
+            _compare(found, other)
+    return found
 
 
 def _given_file(path: Path) -> Path:
@@ -170,14 +183,42 @@ def _given_file(path: Path) -> Path:
         return path
     if not path.is_dir():
         raise TokenizerError(f"there is no tokenizer at {path}")
-    for inside in _in_folder(path):
+    for inside in (*_in_folder(path), path / TOKENIZER_JSON):
         if inside.is_file():
             return inside
-    raise TokenizerError(f"the folder {path} holds no {' or '.join(FILE_NAMES)}")
+    raise TokenizerError(f"the folder {path} holds no {', '.join(FILE_NAMES)} or {TOKENIZER_JSON}")
 
 
 def _in_folder(folder: Path) -> list[Path]:
     return [parent / name for parent in (folder, folder / "assets") for name in FILE_NAMES]
+
+
+def _compare(used: PromptTokenizer, other: Path) -> None:
+    """Log a warning if another of the checkpoint's tokenizers has other pieces, or can't be read."""
+    try:
+        encoder = _encoder(other)[0]
+    except TokenizerError as error:
+        logger.warning("the tokenizer %s isn't compared with the checkpoint's own: %s", used.source, error)
+        return
+    ours, theirs = _pieces(used.encoder), _pieces(encoder)
+    place = differing_piece(ours, theirs)
+    if place is not None:
+        logger.warning(
+            "the tokenizer %s isn't the checkpoint's own, %s: id %d is %r there and %r here. Prompts won't mean to the "
+            "model what they say, unless it was trained with the first",
+            used.source,
+            other,
+            place,
+            theirs[place],
+            ours[place],
+        )
+
+
+def _pieces(encoder: object) -> list[str]:
+    if isinstance(encoder, TokenizerJson):
+        return encoder.pieces[: encoder.size]
+    assert isinstance(encoder, sentencepiece.SentencePieceProcessor)
+    return [encoder.id_to_piece(place) for place in range(encoder.vocab_size())]
 
 
 def cached_tokenizer() -> Path:
@@ -206,6 +247,27 @@ def _not_found(places: Sequence[Path]) -> str:
 
 
 def _open(path: Path, vocab_size: int) -> PromptTokenizer:
+    encoder, pieces = _encoder(path)
+    if pieces > vocab_size:
+        raise TokenizerError(
+            f"{path} has {pieces} pieces, but the model's vocabulary has {vocab_size} entries; "
+            f"use the tokenizer that the model was trained with"
+        )
+    if pieces < 0.9 * vocab_size:
+        logger.warning(
+            "the tokenizer %s has %d pieces and the model %d: prompts won't mean to a trained model what they say",
+            path,
+            pieces,
+            vocab_size,
+        )
+    return PromptTokenizer(encoder, vocab_size=vocab_size, source=str(path))
+
+
+def _encoder(path: Path) -> tuple[Encoder, int]:
+    """A file's tokenizer and how many pieces its vocabulary has."""
+    if path.suffix == ".json":
+        found = TokenizerJson(path)
+        return found, found.size
     try:
         content = read_bytes(path, TokenizerError, limit=_MAX_BYTES)
         processor = sentencepiece.SentencePieceProcessor(model_proto=content)
@@ -215,18 +277,6 @@ def _open(path: Path, vocab_size: int) -> PromptTokenizer:
         raise TokenizerError(f"{path} isn't a readable SentencePiece model: {shown(str(error))}") from error
     if pieces == 0:  # an empty file parses as an empty model
         raise TokenizerError(f"{path} isn't a SentencePiece model: it has no pieces")
-    if pieces > vocab_size:
-        raise TokenizerError(
-            f"{path} has {pieces} pieces, but the model's vocabulary has {vocab_size} entries; "
-            f"use the tokenizer that the model was trained with"
-        )
     if bos < 0:
         raise TokenizerError(f"{path} has no beginning-of-sequence piece, which every prompt starts with")
-    if pieces < 0.9 * vocab_size:
-        logger.warning(
-            "the tokenizer %s has %d pieces and the model %d: prompts won't mean to a trained model what they say",
-            path,
-            pieces,
-            vocab_size,
-        )
-    return PromptTokenizer(processor, vocab_size=vocab_size, source=str(path))
+    return processor, pieces

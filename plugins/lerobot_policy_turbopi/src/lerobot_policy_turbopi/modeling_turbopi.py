@@ -25,6 +25,7 @@ from turbopi.arguments import checked_steps
 from turbopi.errors import ActionError, CheckpointError, ConfigError, ObservationError
 from turbopi.observation import Observation
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.reading import file_inside, read_json
 
 logger = logging.getLogger(__name__)
 
@@ -105,6 +106,10 @@ class TurboPiPolicy(PreTrainedPolicy):
         """Forget the rest of the chunk: the next `select_action` looks at its observation."""
         self._actions.clear()
 
+    def drop_queued_actions(self) -> None:
+        """The same. LeRobot after 0.6.1 calls it within an episode, when the task changes; no other state is kept."""
+        self._actions.clear()
+
     def forward(self, batch: dict[str, Tensor], **unused: Any) -> NoReturn:
         raise NotImplementedError(NO_TRAINING)
 
@@ -112,13 +117,20 @@ class TurboPiPolicy(PreTrainedPolicy):
         raise NotImplementedError(NO_TRAINING)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """The options and the processors, for --policy.path; the weights stay where they are."""
+        """The options, the processors and what lies beside them, for --policy.path; the weights stay where they are."""
         assert self.config.checkpoint is not None
         folder = local_folder(self.config)
         named = self.config.checkpoint if not Path(self.config.checkpoint).is_dir() else str(folder.absolute())
         replace(self.config, checkpoint=named)._save_pretrained(save_directory)
         for file in folder.glob("policy_*processor*"):
             shutil.copy(file, save_directory)
+            for artifact in _artifacts(file) if file.suffix == ".json" else ():
+                source, target = (file_inside(where, artifact, file) for where in (folder, save_directory))
+                if source.is_dir():
+                    shutil.copytree(source, target, dirs_exist_ok=True)
+                else:
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(source, target)
 
     # -- a batch in the model's words ----------------------------------------------------------------------------------
 
@@ -171,7 +183,7 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
     # the edges are those of the LeRobot that runs, whichever wrote the checkpoint, and so is its time grid
     ours = replace(checkpoint.config, image_resize="lerobot").with_model(time_grid="multiplied")
     policy = UnifiedPolicy(
-        replace(checkpoint, config=ours),
+        replace(checkpoint, config=ours, named_tokenizer=None),
         backend=config.backend,
         precision=cast(Any, config.precision),
         quantization=config.quantization,
@@ -187,6 +199,12 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         seconds = policy.warmup(horizons=config.chunk_size)
         logger.info("warm after %.1f s", seconds)
     return policy
+
+
+def _artifacts(processors: Path) -> list[str]:
+    """What processors name beside their file, the tokenizer's folder for one: LeRobot declares it after 0.6.1."""
+    steps = read_json(processors).get("steps") or []
+    return [str(name) for step in steps for name in step.get("artifacts", {}).values()]
 
 
 def local_folder(config: TurboPiConfig) -> Path:
