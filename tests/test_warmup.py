@@ -208,7 +208,7 @@ def test_a_horizon_beyond_the_cache_is_one_clear_error_and_forgets_nothing() -> 
 def test_a_backend_with_engines_for_one_horizon_refuses_another(
     reference: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert {name for name in backends.BACKENDS if not backends._backend_class(name).any_horizon} == {
+    assert {name for name in backends.BACKENDS if not backends.class_of(name).any_horizon} == {
         name for name in backends.BACKENDS if name.startswith("tensorrt")
     }
     monkeypatch.setattr(type(reference.backend), "any_horizon", False)
