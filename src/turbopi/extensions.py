@@ -69,7 +69,7 @@ def _found(group: str, built_in: frozenset[str], path: tuple[str, ...]) -> Mappi
             by_name.setdefault(one.name, []).append(one)
     for several in by_name.values():
         if len(several) > 1:
-            logger.warning("skipped, as they have one name, the %s", "; the ".join(map(str, several)))
+            logger.warning("skipped, as they have one name, the %s", "; the ".join(sorted(map(str, several))))
     return {name: several[0] for name, several in sorted(by_name.items()) if len(several) == 1}
 
 

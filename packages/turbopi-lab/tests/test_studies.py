@@ -63,7 +63,7 @@ def test_the_command_is_listed_and_its_help_is_whole(monkeypatch: pytest.MonkeyP
     listed = text_of(turbopi("--help").stdout)
     assert " study " in listed and "Of turbopi-lab 0.1.0" in listed
     assert text_of(turbopi("study", "--help").stdout).split("Examples ")[1].startswith("turbopi study steps --small")
-    app = typer.Typer()
+    app = typer.Typer(add_completion=False)
     command.declare(app, "study")
     check_help(typer.main.get_command(app), "study")
 
