@@ -138,7 +138,7 @@ def test_unknown_backends_are_told_of_those_that_are_installed(documented: Path)
     [
         ("import toy_missing", "can't load the {}: ModuleNotFoundError: No module named 'toy_missing'"),
         ("command = 3", "the {} is no command: TypeError: 3 is not a callable object"),
-        ("def command(x: dict) -> None: ...", "the {} is no command: RuntimeError: Type not yet supported"),
+        ("def command(x: 'Missing') -> None: ...", "the {} is no command: NameError: name 'Missing' is not defined"),
     ],
 )
 def test_a_broken_command_is_named_where_it_runs_and_nowhere_else(site: Path, code: str, said: str) -> None:
@@ -197,7 +197,7 @@ def test_a_command_of_turbopi_lab_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.setattr(extensions, "found", lambda *_: {})
     for words in (("study",), ("study", "--help"), ("study", "steps", "--small")):
         assert refusal(turbopi(*words)) == (
-            "`turbopi study` comes with the package turbopi-lab: pip install turbopi-lab, "
-            "or in a clone pip install -e packages/turbopi-lab"
+            "`turbopi study` comes with the package turbopi-lab; in Turbo-Pi's clone: "
+            "pip install -e packages/turbopi-lab"
         )
     assert " study " not in text_of(turbopi("--help").stdout)

@@ -12,7 +12,7 @@ from turbopi.cli.framework import Command, Described, app, describe, log_to_stde
 from turbopi.errors import ConfigError
 
 ELSEWHERE = {  # commands of ours that are installed apart
-    "study": "`turbopi study` comes with the package turbopi-lab: pip install turbopi-lab, or in a clone "
+    "study": "`turbopi study` comes with the package turbopi-lab; in Turbo-Pi's clone: "
     "pip install -e packages/turbopi-lab"
 }
 

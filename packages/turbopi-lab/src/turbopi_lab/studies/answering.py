@@ -35,14 +35,17 @@ Answering = Callable[[Asked], Tensor]  # -> chunks float32[B, H, A], normalised
 
 
 class AnsweringPolicy(LocalPolicy):
-    """The float32 reference's policy, with `answer` in its model's place."""
+    """The float32 reference's policy, whose backend samples with `answer`."""
 
     def __init__(
         self, policy: UnifiedPolicy, weights: str, answer: Answering, protocol: Protocol, jobs: Sequence[Job]
     ) -> None:
         super().__init__(policy, weights)
-        assert isinstance(policy.backend, PyTorchBackend)
-        policy.backend = self._backend = _AnsweringBackend(policy.backend, answer)
+        backend = policy.backend
+        assert isinstance(backend, PyTorchBackend)
+        self._device, self._answer = backend.device, answer
+        backend.sample = self._sample  # type: ignore[method-assign]
+        self._asked: list[tuple[Key, int]] = []
         self._places: dict[int, tuple[Key, int]] = {}
         for job in jobs:
             for number, step in enumerate(range(0, protocol.max_steps or job.task.max_steps, protocol.replan)):
@@ -54,20 +57,13 @@ class AnsweringPolicy(LocalPolicy):
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        self._backend.places = [self._places[seed] for seed in seeds]
+        self._asked = [self._places[seed] for seed in seeds]
         return super().infer(observations, seeds, arguments)
 
-
-class _AnsweringBackend(PyTorchBackend):
-    def __init__(self, plain: PyTorchBackend, answer: Answering) -> None:
-        vars(self).update(vars(plain))
-        self._answer = answer
-        self.places: list[tuple[Key, int]] = []
-
-    def sample(
+    def _sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        assert len(self.places) == len(noise), "a call of the model for each call of the policy"
-        episodes, numbers = zip(*self.places, strict=True)
-        asked = Asked(observation.to(self.device), noise.to(self.device), num_steps, episodes, numbers)
+        assert len(self._asked) == len(noise), "a call of the model for each call of the policy"
+        episodes, numbers = zip(*self._asked, strict=True)
+        asked = Asked(observation.to(self._device), noise.to(self._device), num_steps, episodes, numbers)
         return Sample(self._answer(asked).cpu(), {})
