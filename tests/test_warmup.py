@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import golden_model
-from test_begin import CPU, Unrun, on_cpu
+from policy_helpers import policy_on
+from test_begin import Unrun, on_cpu
 from test_engine import made_up
 
 from turbopi import UnifiedPolicy, backends
@@ -30,15 +31,7 @@ def captures(policy: UnifiedPolicy) -> set[Any]:
 
 def made(*, strict: bool = False, robot: str = "plain", cls: Any = Unrun) -> UnifiedPolicy:
     """A policy whose backend captures: `plain` sends one camera, two or three."""
-    checkpoint = random_checkpoint("pi05_tiny")
-    policy = UnifiedPolicy(
-        checkpoint, backend="pytorch", device="cpu", precision="f32", num_denoising_steps=2, robot=robot
-    )
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    backend = cls(policy.config.model, load, device=CPU, precision="f32")
-    backend.strict = strict
-    policy.backend = backend
-    return policy
+    return policy_on(cls, random_checkpoint("pi05_tiny"), num_denoising_steps=2, robot=robot, strict=strict)
 
 
 def seen_by(cameras: int, policy: UnifiedPolicy, prompt: str = "pick") -> dict[str, Any]:

@@ -79,7 +79,7 @@ def _read(group: str) -> Iterator[Extension]:
     except Exception:  # somebody's metadata is damaged: find out whose
         points = list(_by_distribution(group))
     for point in points:
-        about = point.dist.metadata if point.dist is not None else {}
+        about: Any = point.dist.metadata if point.dist is not None else {}
         named = f"{about['Name']} {about['Version']}" if about else "a distribution without a name"
         yield Extension(group, point.name, point.value, named, about["Summary"] or "" if about else "")
 

@@ -126,17 +126,20 @@ _SPECS = (
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
 _RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}  # Turbo-Pi's own
-_MEMBERS = ("name", "precisions", "any_horizon", "unavailable", "warmup", "prefix", "denoise", "sample")  # of a backend
-_MEMBERS += ("intermediates", "describe")
+_MEMBERS = (  # of every backend
+    *("name", "precisions", "any_horizon", "unavailable", "warmup", "prefix", "denoise", "sample", "intermediates"),
+    "describe",
+)
 
 
 def known() -> dict[str, BackendSpec]:
     """All backends by name: Turbo-Pi's own, then those of other distributions, which this doesn't import."""
     others = extensions.found(extensions.BACKENDS, [*BACKENDS, "auto"])
-    return BACKENDS | {
-        name: BackendSpec(name, *one.value.split(":"), f"{one.summary} ({one.distribution})".strip(), one)
-        for name, one in others.items()
-    }
+    found = dict(BACKENDS)
+    for name, one in others.items():
+        module, _, cls = one.value.partition(":")
+        found[name] = BackendSpec(name, module, cls, f"{one.summary} ({one.distribution})".strip(), one)
+    return found
 
 
 def listed() -> dict[str, BackendSpec]:

@@ -27,7 +27,7 @@ def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
     """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
     from turbopi import backends
     from turbopi.arguments import Denoising
-    from turbopi.backends.abilities import Held
+    from turbopi.backends.abilities import Abilities
     from turbopi.joining import Joining
 
     fitting = options.for_checkpoint(checkpoint)
@@ -37,7 +37,7 @@ def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
     kind: Any = backends.class_of(name)  # a class has its instances' capabilities
     asked = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
     no_pipeline: Any = None  # no observation is read
-    modes = Joining(checkpoint.config, no_pipeline, Held(lambda: kind), asked.integration).modes
+    modes = Joining(checkpoint.config, no_pipeline, Abilities(kind), asked.integration).modes
     batches = isinstance(kind, backends.RunsBatches) and (asked.integration is None or asked.integration.is_euler)
     return Offers(
         real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},

@@ -45,7 +45,7 @@ class AnsweringPolicy(LocalPolicy):
         assert isinstance(backend, PyTorchBackend)
         self._device, self._answer = backend.device, answer
         backend.sample = self._sample  # type: ignore[method-assign]
-        self._asked: list[tuple[Key, int]] = []
+        self._current: list[tuple[Key, int]] = []
         self._places: dict[int, tuple[Key, int]] = {}
         for job in jobs:
             for number, step in enumerate(range(0, protocol.max_steps or job.task.max_steps, protocol.replan)):
@@ -57,13 +57,13 @@ class AnsweringPolicy(LocalPolicy):
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        self._asked = [self._places[seed] for seed in seeds]
+        self._current = [self._places[seed] for seed in seeds]
         return super().infer(observations, seeds, arguments)
 
     def _sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        assert len(self._asked) == len(noise), "a call of the model for each call of the policy"
-        episodes, numbers = zip(*self._asked, strict=True)
+        assert len(self._current) == len(noise), "a call of the model for each call of the policy"
+        episodes, numbers = zip(*self._current, strict=True)
         asked = Asked(observation.to(self._device), noise.to(self._device), num_steps, episodes, numbers)
         return Sample(self._answer(asked).cpu(), {})
