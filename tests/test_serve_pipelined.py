@@ -118,7 +118,7 @@ def test_stopping_answers_what_is_in_flight() -> None:
 
 def test_a_pipelined_backends_served_actions_are_its_own(tmp_path: Path) -> None:
     """The real backend on its engines' twins, under three robots at once."""
-    policy = policy_on(
+    policy: Any = policy_on(
         on_twins(TensorRTPipelinedBackend, tmp_path), random_checkpoint("pi05_tiny"), num_denoising_steps=2
     )
     assert policy.pipelined
