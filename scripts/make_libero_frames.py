@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
 """Make `src/turbopi/data/libero/`: a few real observations of LIBERO with what the expert does next, and statistics.
 
-The expert that the small policy learned from (tools/small_policy) plays one episode of each libero_spatial task, from
-an initial state that the policy never saw. At set moments of some of them the two pictures, the state, the prompt and
-the expert's next ten actions are kept, exactly as the evaluation shows them, before they are resized to 224. States and
-actions of all episodes give `norm_stats.json`, in openpi's format: plausible numbers for a policy with random weights.
+The expert that the small policy learned from (turbopi_lab.small_policy) plays one episode of each libero_spatial task,
+from an initial state that the policy never saw. At set moments of some of them the two pictures, the state, the prompt
+and the expert's next ten actions are kept, exactly as the evaluation shows them, before they are resized to 224. States
+and actions of all episodes give `norm_stats.json`, in openpi's format: plausible numbers for a policy with random
+weights.
 
 The pictures are LIBERO's renders; LIBERO is MIT licensed, Copyright (c) 2023 Lifelong Robot Learning.
 
-It needs turbopi[libero] and a software renderer (Debian: libosmesa6), and takes a minute or two.
+It needs turbopi-lab, turbopi[libero] and a software renderer (Debian: libosmesa6), and takes a minute or two.
 
-    PYTHONPATH=src:tools MUJOCO_GL=osmesa python scripts/make_libero_frames.py [--out FOLDER]
+    MUJOCO_GL=osmesa python scripts/make_libero_frames.py [--out FOLDER]
 """
 
 import argparse
@@ -22,11 +23,11 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from small_policy.expert import Expert
-from small_policy.scenes import BOWL, INSTRUCTIONS, MAX_STEPS, NUM_TASKS, SUITE, PracticeScene
 
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, dump_norm_stats
 from turbopi.sim.libero import openpi_state
+from turbopi_lab.small_policy.expert import Expert
+from turbopi_lab.small_policy.scenes import BOWL, INSTRUCTIONS, MAX_STEPS, NUM_TASKS, SUITE, PracticeScene
 
 OUT = Path(__file__).parent.parent / "src" / "turbopi" / "data" / "libero"
 INITIAL_STATE = 30  # the policy was trained on 0 to 24
@@ -128,7 +129,7 @@ README = """\
 Real observations of the LIBERO benchmark for the demo, made by `scripts/make_libero_frames.py`.
 
 - Suite {suite}, initial state {state}, which the small policy never saw in its training; ten steps of standing
-  still, then the scripted expert of `tools/small_policy` acts. `step` counts its actions.
+  still, then the scripted expert of `turbopi_lab.small_policy` acts. `step` counts its actions.
 - `*_base.jpg`: camera agentview; `*_wrist.jpg`: camera robot0_eye_in_hand. 256 × 256, JPEG quality {quality},
   turned by 180 degrees as openpi's client does: upright, but mirrored left to right, as its models expect.
 - `state` in frames.json: end effector position (3, metres, world axes), orientation as axis-angle (3, radians),

@@ -3,7 +3,9 @@
 import gc
 import re
 import signal
+from typing import Any
 
+import typer
 from typer.testing import CliRunner, Result
 
 from turbopi.cli import app
@@ -40,3 +42,22 @@ def refusal(result: Result, *, whole: bool = True) -> str:
     assert result.stderr.startswith("error: ")
     assert "Traceback" not in result.stderr
     return result.stderr.removeprefix("error: ").rstrip("\n")
+
+
+def check_help(command: Any, *words: str) -> None:
+    """That `turbopi WORDS --help` cuts or breaks no word of its options and examples at the terminal's 80 columns."""
+    output = turbopi(*words, "--help").stdout
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
+    assert max(map(len, lines)) <= 80
+    found = text_of(output).split()
+    for one in command.get_params(typer.Context(command)):
+        if not getattr(one, "hidden", False):
+            said = [one.metavar or "", getattr(one, "help", None) or ""]
+            missing = {word for text in said for word in text.split()} - set(found)
+            assert not missing, f"{one.opts}: {missing}"
+        if one.opts[0].startswith("-") and not getattr(one, "hidden", False):
+            assert set(one.opts + one.secondary_opts) <= set(found)
+    for example in re.findall(r"\[cyan\](.*?)\[/\]", command.epilog or ""):
+        shown = example.replace(r"\[", "[")
+        assert f" {shown}" in (line.rstrip() for line in lines), "an example is longer than a line"
+    assert "<bool>" not in found, "a flag takes no value"

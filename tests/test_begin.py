@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import golden_model
+from policy_helpers import policy_on
 from test_engine import answer, made_up, shape_of, static_call
 
 from turbopi import UnifiedPolicy
@@ -88,10 +89,7 @@ def reference() -> UnifiedPolicy:
 
 @pytest.fixture
 def policy(reference: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> UnifiedPolicy:
-    checkpoint = random_checkpoint("pi05_tiny")
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    policy = UnifiedPolicy(checkpoint, backend="pytorch", device="cpu", precision="f32", num_denoising_steps=2)
-    policy.backend = OnCpu(policy.config.model, load, device=CPU, precision="f32")
+    policy = policy_on(OnCpu, random_checkpoint("pi05_tiny"), num_denoising_steps=2)
     encoder = policy.pipeline.tokenizer.encoder
 
     class Telling:

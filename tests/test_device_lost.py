@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from policy_helpers import policy_on
 
 from turbopi import UnifiedPolicy
 from turbopi.backends import Sample, lost
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.lost import STICKY, why_lost
+from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import BackendError, BackendUnavailable, DeviceLost, ObservationError
 
@@ -62,10 +64,12 @@ class FailingLater(Failing):
 
 @pytest.fixture
 def policy() -> UnifiedPolicy:
-    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", num_denoising_steps=1)
-    backend: Any = Failing(policy.backend)
-    policy.backend = backend
-    return policy
+    return failing(Failing)
+
+
+def failing(cls: type[Failing]) -> UnifiedPolicy:
+    make = lambda *arguments, **options: cls(PyTorchBackend(*arguments, **options))  # noqa: E731
+    return policy_on(make, random_checkpoint("pi05_tiny"), precision="bf16", num_denoising_steps=1)
 
 
 def test_a_sticky_error_loses_the_device_and_later_calls_dont_touch_it(policy: UnifiedPolicy) -> None:
@@ -100,9 +104,9 @@ CALLS: dict[str, Callable[[UnifiedPolicy, dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_every_way_to_call_finds_it_out(policy: UnifiedPolicy, call: str) -> None:
-    backend: Any = FailingLater(policy.backend)
-    policy.backend = backend
+def test_every_way_to_call_finds_it_out(call: str) -> None:
+    policy = failing(FailingLater)
+    backend: Any = policy.backend
     backend.fail = accelerator_error("CUDA error: unspecified launch failure", 719)
     obs = policy.example_observation()
     with pytest.raises(DeviceLost, match="cudaErrorLaunchFailure, 719"):

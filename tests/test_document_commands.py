@@ -37,8 +37,8 @@ def mentioned(document: Path) -> Iterator[list[str]]:
 
 def command_of(words: list[str]) -> click.Command:
     context = click.Context(GROUP)  # type: ignore[arg-type]
-    command = GROUP.get_command(context, words[0])  # type: ignore[attr-defined]
-    assert command is not None, f"there is no `turbopi {words[0]}`"
+    assert GROUP.get_command(context, words[0]) is not None, f"there is no `turbopi {words[0]}`"  # type: ignore[attr-defined]
+    command: click.Command = GROUP.resolve_command(context, words[:1])[1]  # type: ignore[attr-defined]
     return command
 
 

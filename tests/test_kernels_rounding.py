@@ -19,7 +19,6 @@ from turbopi.quantization.formats import FORMATS, Format
 from turbopi.quantization.fp8 import Directions, to_e4m3
 from turbopi.quantization.int8 import to_int8
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
-from turbopi.studies.formats import round_nvfp4
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 pytestmark = gpu_or_interpreter()
@@ -92,12 +91,6 @@ def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int, format
     twin = round_with_feedback_plain(weight, inverse, order, errors, answers, format)
     assert torch.equal(ours.float(), twin.float())
     assert not torch.equal(twin.float(), format.rounded(weight, inverse[:, None]).float()) or columns == 1
-
-
-def test_errors_of_nvfp4_cancel_too() -> None:
-    weight, seen = random(20, 64) / 50, activations(200, 64)
-    spared, nearest = round_nvfp4(weight, directions(seen)), round_nvfp4(weight)
-    assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
 
 
 def in_e4m3(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_every_file_of_the_package(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        packed = {name.removeprefix("turbopi/") for name in archive.namelist() if name.startswith("turbopi/")}
+        names = archive.namelist()
+    packed = {name.removeprefix("turbopi/") for name in names if name.startswith("turbopi/")}
+    rest = {name.split("/")[0] for name in names} - {"turbopi"}
+    assert len(rest) == 1 and rest.pop().endswith(".dist-info"), "no tools, and nothing of turbopi-lab"
     written = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*")

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_begin import CPU, OnCpu
+from policy_helpers import policy_on
+from test_begin import OnCpu
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
@@ -126,11 +127,7 @@ def reference() -> UnifiedPolicy:
 
 @pytest.fixture(scope="module")
 def policy(reference: UnifiedPolicy) -> UnifiedPolicy:
-    checkpoint = random_checkpoint("pi05_tiny")
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    policy = UnifiedPolicy(checkpoint, backend="pytorch", device="cpu", precision="f32", robot="plain")
-    policy.backend = OnCpu(policy.config.model, load, device=CPU, precision="f32")
-    return policy
+    return policy_on(OnCpu, random_checkpoint("pi05_tiny"), robot="plain")
 
 
 class Resizing(OnCpu):
@@ -152,10 +149,8 @@ def resize_by_table(table: torch.Tensor, images: torch.Tensor) -> None:
 def test_a_backend_that_resizes_launches_vision_in_the_form_that_its_pictures_need(
     reference: UnifiedPolicy, size: tuple[int, int]
 ) -> None:
-    checkpoint = random_checkpoint("pi05_tiny")
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    policy = UnifiedPolicy(checkpoint, backend="pytorch", device="cpu", precision="f32", robot="plain")
-    policy.backend = backend = Resizing(policy.config.model, load, device=CPU, precision="f32")
+    policy = policy_on(Resizing, random_checkpoint("pi05_tiny"), robot="plain")
+    backend: Any = policy.backend
     seen = {"base_0_rgb": picture(*size), "left_wrist_0_rgb": picture(224, 224, seed=1)}
     observation = {"images": seen, "state": np.zeros(7), "prompt": "pick"}
     for _ in range(2):

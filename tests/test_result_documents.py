@@ -21,12 +21,6 @@ from turbopi.calibrate.report import read_report
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
-from turbopi.studies.actions import BackendOff
-from turbopi.studies.certificates import CondensedDimension, WorstPlace
-from turbopi.studies.fp8_and_fp4 import Research
-from turbopi.studies.mask import CacheOff
-from turbopi.studies.throughput import Throughput
-from turbopi.verify.document import Determinism
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -191,12 +185,6 @@ def test_a_benchmark_reads_the_same_whichever_way_a_number_is_written() -> None:
     assert fingerprint(as_document(content, BenchDocument, "FILE")) == fingerprint(whole) != fingerprint(first)
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name.endswith("fp8_research.json")])
-def test_checked_in_research_reads_and_comes_out_as_it_was(name: str) -> None:
-    document = read_document(RESULTS / name, Research, ConfigError)
-    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
-
-
 CONTENTS = {name: json.loads((RESULTS / name).read_text()) for name in EVERY}
 OF_TURNS = [name for name, of in CONTENTS.items() if isinstance(of, dict) and {"rows", "provenance"} <= of.keys()]
 
@@ -244,27 +232,3 @@ def test_the_checked_in_calibrations_report_reads_and_comes_out_as_it_was() -> N
     del report["held_out"]["fp8-mlp"]
     with pytest.raises(CalibrationError, match=r"report: held_out\.'?fp8-mlp'? is missing"):
         read_report(report)
-
-
-def test_the_tables_of_checked_in_certificates_read_and_come_out_as_they_were() -> None:
-    """The certificates as a whole were shortened by hand."""
-    kinds: dict[str, type[Struct]] = {"dimensions": CondensedDimension, "intermediates": WorstPlace}
-    content = json.loads((RESULTS / "h200_2026-11-22_fp8_certificates.json").read_text())
-    read = 0
-    for tiers in content["certificates"].values():
-        for tier in (tiers["fp8"], tiers["fp8-mlp"]):
-            assert plain_document(as_document(tier["determinism"], Determinism, "FILE")) == tier["determinism"]
-            for key, kind in kinds.items():
-                for row in tier.get(key, {}).values():
-                    assert plain_document(as_document(row, kind, "FILE")) == row
-                    read += 1
-    assert read > 30
-
-
-def test_the_parts_of_the_checked_in_study_read_and_come_out_as_they_were() -> None:
-    """Two runs were put into one file by hand, and the precision study lost its cosines."""
-    content = json.loads((RESULTS / "h200_2026-11-21_tensorrt_study.json").read_text())
-    rows: list[tuple[type[Struct], dict[str, object]]] = [(Throughput, content["throughput"])]
-    rows += [(CacheOff, row) for row in content["mask"]] + [(BackendOff, row) for row in content["actions"]]
-    for kind, row in rows:
-        assert json.dumps(plain_document(as_document(row, kind, "FILE"))) == json.dumps(row)

@@ -10,11 +10,12 @@ import pytest
 import torch
 from checkpoint_helpers import lerobot_copy
 from conftest import golden_model
+from policy_helpers import policy_on
 from test_begin import OnCpu
 from test_policy import golden_policy
 
 from turbopi import UnifiedPolicy, open_checkpoint
-from turbopi.backends.abilities import Held
+from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import RealTime
@@ -45,11 +46,7 @@ def trained_policy(engine: type[OnCpu] | None = None) -> UnifiedPolicy:
     """Trained with simulated delays. With an engine without its graphs it runs observations together."""
     checkpoint = random_checkpoint("pi05_tiny")
     checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, real_time=TRAINED))
-    made = UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
-    if engine is not None:
-        load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-        made.backend = engine(made.config.model, load, device=torch.device("cpu"), precision="f32")
-    return made
+    return policy_on(engine or PyTorchBackend, checkpoint, num_denoising_steps=2)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +112,7 @@ def test_identitys_mask_ends_where_it_does_in_chunks_of_another_length(
 ) -> None:
     """Of a policy whose mask ends at 6; a shorter chunk's ends with the left-over of 4."""
     config = dataclasses.replace(policy.config, real_time=RealTime(execution_horizon=H - 6))
-    joining = Joining(config, policy._pipeline, Held(lambda: policy.backend))
+    joining = Joining(config, policy._pipeline, policy.backend)
     ((_, chunk),) = joining.checked([None], [RunningChunk(rows(4), 1, mode="rtc_identity")], 2, horizon).rows
     assert chunk is not None and chunk.execution_horizon == s
 

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from policy_helpers import policy_on
 from serve_fakes import PipelinedFakePolicy, observation
 from tensorrt_fakes import on_twins
 from test_serve_server import client, eventually, infer, metric, refused, stop_while_the_client_has_left
 from websockets.exceptions import ConnectionClosed
 
-from turbopi import UnifiedPolicy
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.serve import PolicyServer
@@ -138,12 +137,8 @@ def test_an_answer_that_never_comes_holds_no_stop(monkeypatch: pytest.MonkeyPatc
 
 def test_a_pipelined_backends_served_actions_are_its_own(tmp_path: Path) -> None:
     """The real backend on its engines' twins, under three robots at once."""
-    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", num_denoising_steps=2)
-    assert not policy.pipelined
-    twins: Any = on_twins(TensorRTPipelinedBackend, tmp_path)
-    checkpoint, cpu = random_checkpoint("pi05_tiny"), torch.device("cpu")
-    policy.backend = twins(
-        policy.config.model, lambda to, mode: checkpoint.load(to, mode).state, device=cpu, precision="f32"
+    policy: Any = policy_on(
+        on_twins(TensorRTPipelinedBackend, tmp_path), random_checkpoint("pi05_tiny"), num_denoising_steps=2
     )
     assert policy.pipelined
     steady = policy._noise

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluate_fakes import SeekingPolicy
-from small_policy.scenes import INSTRUCTIONS
 
 from turbopi.evaluate.plan import Protocol, VideoPlan, choose_tasks, make_jobs
 from turbopi.evaluate.run import evaluate, prepare
@@ -190,8 +189,3 @@ def test_the_small_policy_solves_tasks_it_was_trained_for(tmp_path: Path) -> Non
     results = prepare(tmp_path, protocol, source, simulator, jobs, restart=False)
     evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
     assert sum(episode.success for episode in results.in_order()) >= 1
-
-
-def test_the_tools_know_the_suites_instructions() -> None:
-    told = [task.instruction for task in create("libero").tasks(SUITE)]
-    assert list(INSTRUCTIONS) == told

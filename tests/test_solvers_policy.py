@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 from cli_helpers import refusal, turbopi
+from policy_helpers import policy_on
 from test_begin import Unrun
 
 from turbopi import UnifiedPolicy
-from turbopi.backends.pytorch import PyTorchBackend, reference_model
+from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.errors import ConfigError, ObservationError
@@ -164,10 +165,8 @@ def test_a_conditioning_with_times_of_its_own_contradicts_a_solver(policy: Unifi
 
 
 def test_a_solvers_loop_is_warmed_up(tiny: Any) -> None:
-    policy = made(tiny, solver="exponential", num_denoising_steps=3)
-    state = reference_model(policy.backend).state_dict()
-    load = lambda device, precision: dict(state)  # noqa: E731
-    policy.backend = engine = Unrun(policy.config.model, load, device=torch.device("cpu"), precision="f32")
+    policy = policy_on(Unrun, tiny, solver="exponential", num_denoising_steps=3)
+    engine: Any = policy.backend
     policy.warmup(cameras=2, steps=[2, 3])
     assert {str(loop) for loop in engine._recent} == {
         "H=10, 2 steps, exponential, t = 1, 0.5, 0",

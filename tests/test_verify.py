@@ -19,10 +19,9 @@ from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
-from turbopi.reading import as_document, plain_document, read_document
+from turbopi.reading import plain_document, read_document
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
-from turbopi.studies import certificates
 from turbopi.verify.check_golden import _compare_rounded, check_case
 from turbopi.verify.document import Certificate, Judged
 from turbopi.verify.golden import GoldenFolder, Run
@@ -368,28 +367,6 @@ def test_anothers_file_is_not_replaced_by_a_certificate(tmp_path: Path) -> None:
 
 def test_no_weights_are_refused() -> None:
     assert "no weights" in refusal(turbopi("verify"))
-
-
-# Certificates for tables
-
-
-def test_a_certificate_is_condensed_to_the_worst_of_every_name() -> None:
-    document = certified("pytorch", "--precision", "bf16")
-    condensed: Any = plain_document(certificates.condensed(as_document(document, Certificate, "stdout")))
-    rows = [row for row in document["intermediates"] if row["name"] == "kv_k"]
-    worst = max(rows, key=lambda row: row["relative_rms"])
-    assert condensed["intermediates"]["kv_k"]["at"] == worst["index"]
-    assert condensed["intermediates"]["kv_k"]["relative_rms"] == pytest.approx(worst["relative_rms"], rel=1e-3)
-    assert condensed["verdict"] == document["verdict"]
-    assert len(json.dumps(condensed, allow_nan=False)) < len(json.dumps(document)) / 2
-
-
-def test_varied_observations_are_no_two_alike_and_come_again() -> None:
-    first, again, other = (list(certificates.varied(seed, 8)) for seed in (0, 0, 1))
-    pictures = [np.asarray(one["observation/image"]).tobytes() for one in (*first, *other)]
-    assert len(set(pictures)) == 16
-    assert [np.asarray(one["observation/image"]).tobytes() for one in again] == pictures[:8]
-    assert tiny_policy().prepare(first[7]).token_mask.any()
 
 
 # The numbers themselves

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import golden_model
+from policy_helpers import policy_on
 from test_begin import CPU, Unrun, on_cpu
 from test_engine import made_up
 
@@ -31,15 +32,7 @@ def captures(policy: UnifiedPolicy) -> set[Any]:
 
 def made(*, strict: bool = False, robot: str = "plain", cls: Any = Unrun) -> UnifiedPolicy:
     """A policy whose backend captures: `plain` sends one camera, two or three."""
-    checkpoint = random_checkpoint("pi05_tiny")
-    policy = UnifiedPolicy(
-        checkpoint, backend="pytorch", device="cpu", precision="f32", num_denoising_steps=2, robot=robot
-    )
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    backend = cls(policy.config.model, load, device=CPU, precision="f32")
-    backend.strict = strict
-    policy.backend = backend
-    return policy
+    return policy_on(cls, random_checkpoint("pi05_tiny"), num_denoising_steps=2, robot=robot, strict=strict)
 
 
 def seen_by(cameras: int, policy: UnifiedPolicy, prompt: str = "pick") -> dict[str, Any]:
@@ -259,7 +252,7 @@ def test_every_horizon_fits_with_every_prompt_and_number_of_cameras() -> None:
 def test_a_backend_with_engines_for_one_horizon_refuses_another(
     reference: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert {name for name in backends.BACKENDS if not backends._backend_class(name).any_horizon} == {
+    assert {name for name in backends.BACKENDS if not backends.class_of(name).any_horizon} == {
         name for name in backends.BACKENDS if name.startswith("tensorrt")
     }
     monkeypatch.setattr(type(reference.backend), "any_horizon", False)

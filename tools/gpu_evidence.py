@@ -39,6 +39,7 @@ HOST_ONLY = (
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
     *("turbopi.provenance", "turbopi.toolchain", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
     *("turbopi.policy", "turbopi.joining", "turbopi.model_call", "turbopi.running_chunk", "turbopi.source_code"),
+    "turbopi.extensions",
     "turbopi.backends.onnx",  # refuses every device but the CPU
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")

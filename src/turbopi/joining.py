@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from turbopi.backends.abilities import Held
+from turbopi.backends.abilities import Abilities
 from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.engine.conditioned import batch_form
 from turbopi.errors import ConfigError, ObservationError
@@ -50,7 +50,7 @@ class Joins:
 
 
 class Joining:
-    """Of one policy; `held` tells its backend, `integration` how it denoises unless a call says otherwise.
+    """Of one policy; `able` is its backend, `integration` how it denoises unless a call says otherwise.
 
     Raises ConfigError for an integration that the backend doesn't have.
     """
@@ -59,10 +59,10 @@ class Joining:
         self,
         config: PolicyConfig,
         pipeline: Pipeline,
-        held: Held,
+        able: Abilities,
         integration: Integration | None = None,
     ) -> None:
-        self._config, self._model, self._pipeline, self._held = config, config.model, pipeline, held
+        self._config, self._model, self._pipeline, self._able = config, config.model, pipeline, able
         self._integration = integration
         if integration is not None:
             try:
@@ -75,7 +75,7 @@ class Joining:
         """What `RunningChunk`s may ask of this policy."""
         if self._integration is not None and not self._integration.is_euler:
             return ()  # see `Conditioning`
-        able = self._held().forms
+        able = self._able.forms
         trained = self._config.real_time.trained_max_delay > 0
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
@@ -190,8 +190,8 @@ class Joining:
         return asked
 
     def _check_form(self, form: Form) -> None:
-        if form != "plain" and form not in self._held().forms:
-            backend = self._held().backend
+        if form != "plain" and form not in self._able.forms:
+            backend = self._able.backend
             what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
             if form == "solver":
                 raise ObservationError(

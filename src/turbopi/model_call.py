@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from turbopi import backends
-from turbopi.backends.abilities import Held
+from turbopi.backends.abilities import Abilities
 from turbopi.backends.lost import Guard
 from turbopi.joining import Joining, Joins
 from turbopi.observation import Observation
@@ -34,8 +34,8 @@ class Ran:
 class ModelCall:
     """Of one policy, by the backend that it holds. One call at a time: others wait for `lock`."""
 
-    def __init__(self, pipeline: Pipeline, joining: Joining, held: Held, guard: Guard) -> None:
-        self._pipeline, self._joining, self._held, self._guard = pipeline, joining, held, guard
+    def __init__(self, pipeline: Pipeline, joining: Joining, able: Abilities, guard: Guard) -> None:
+        self._pipeline, self._joining, self._able, self._guard = pipeline, joining, able, guard
         self.lock = threading.Lock()
 
     def run(
@@ -45,7 +45,7 @@ class ModelCall:
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
     ) -> Ran:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        able = self._held()
+        able = self._able
         if len(observations) == 1 and able.begins is not None:
             return self._begin(able.begins, observations[0], joins, noise)
         if able.runs_batches is not None:

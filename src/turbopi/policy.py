@@ -24,7 +24,7 @@ from turbopi.arguments import (
     warm_loops,
 )
 from turbopi.backends import Precision
-from turbopi.backends.abilities import Held
+from turbopi.backends.abilities import Abilities
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
@@ -135,9 +135,9 @@ class UnifiedPolicy:
                 name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
-        held = Held(lambda: self.backend)
-        self._joining = Joining(self.config, self._pipeline, held, self._denoising.integration)
-        self._call = ModelCall(self._pipeline, self._joining, held, self._guard)
+        able = Abilities(self.backend)
+        self._joining = Joining(self.config, self._pipeline, able, self._denoising.integration)
+        self._call = ModelCall(self._pipeline, self._joining, able, self._guard)
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint

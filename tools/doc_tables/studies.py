@@ -5,8 +5,8 @@ from pathlib import Path
 
 from turbopi.errors import ConfigError
 from turbopi.reading import read_document
-from turbopi.studies import report
-from turbopi.studies.report import Report, table_lines
+from turbopi_lab.studies import report
+from turbopi_lab.studies.report import Report, table_lines
 
 
 def read_report(file: Path) -> Report:

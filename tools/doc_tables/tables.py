@@ -314,21 +314,21 @@ def delays(document: Any) -> list[str]:
 
 
 def _read_judged(file: Path) -> Any:
-    from small_policy.judged import load_judged
+    from turbopi_lab.small_policy.judged import load_judged
 
     return load_judged(file)
 
 
 def small_policy(document: Any) -> list[str]:
     """The small policy's runs without delay."""
-    from small_policy.judged import table
+    from turbopi_lab.small_policy.judged import table
 
     return table(document)
 
 
 def small_policy_delays(document: Any) -> list[str]:
     """The small policy under delay, by way to run."""
-    from small_policy.judged import delayed_table
+    from turbopi_lab.small_policy.judged import delayed_table
 
     return delayed_table(document)
 

@@ -22,6 +22,7 @@ from turbopi.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/dev/faults.md"
+FOLDERS = ("src", "packages/turbopi-lab/src", "tests", "tools")  # of modules
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def run_tests(tree: Path, tests: Iterable[str]) -> Ran:
     """Raises RuntimeError if pytest itself failed."""
     xml = tree / "mutate.xml"
     xml.unlink(missing_ok=True)
-    folders = os.pathsep.join(str(tree / name) for name in ("src", "tests", "tools"))
+    folders = os.pathsep.join(str(tree / name) for name in FOLDERS)
     env = os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, (folders, _others()))),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -65,7 +66,7 @@ def run_tests(tree: Path, tests: Iterable[str]) -> Ran:
 
 def _others() -> str:
     """What else is on the caller's PYTHONPATH."""
-    here = {ROOT / name for name in ("src", "tests", "tools")}
+    here = {ROOT / name for name in FOLDERS}
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     return os.pathsep.join(path for path in given if path and Path(path).resolve() not in here)
 

@@ -1,14 +1,17 @@
-"""Backends by name. Each module is imported when its backend is asked for, so a missing library hurts only its user.
+"""Backends by name. Each module is imported when its backend is needed, so a missing library hurts only its user. Other
+distributions may add theirs: docs/extending.md.
 
 Nothing falls back: a backend that can't run raises BackendUnavailable with the reason. Only "auto" chooses, once, and
 says what it chose and why.
 """
 
 import importlib
+import logging
 from dataclasses import dataclass
 
 import torch
 
+from turbopi import extensions
 from turbopi.backends.base import (
     Backend,
     Begins,
@@ -41,21 +44,26 @@ __all__ = [
     "Submits",
     "availability",
     "choose",
+    "class_of",
     "create",
+    "known",
+    "listed",
     "resolve_device",
 ]
 
+logger = logging.getLogger(__name__)
 PRECISIONS: tuple[Precision, ...] = ("bf16", "f32", *TIERS)
 
 
 @dataclass(frozen=True)
 class BackendSpec:
-    """Where a backend lives."""
+    """Where a backend lives. extension: of another distribution's"""
 
     name: str
     module: str
     cls: str
     summary: str
+    extension: extensions.Extension | None = None
 
 
 _SPECS = (
@@ -117,7 +125,33 @@ _SPECS = (
 )
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
 _RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else
-BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}
+BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}  # Turbo-Pi's own
+_MEMBERS = (  # of every backend
+    *("name", "precisions", "any_horizon", "unavailable", "warmup", "prefix", "denoise", "sample", "intermediates"),
+    "describe",
+)
+
+
+def known() -> dict[str, BackendSpec]:
+    """All backends by name: Turbo-Pi's own, then those of other distributions, which this doesn't import."""
+    others = extensions.found(extensions.BACKENDS, [*BACKENDS, "auto"])
+    found = dict(BACKENDS)
+    for name, one in others.items():
+        module, _, cls = one.value.partition(":")
+        found[name] = BackendSpec(name, module, cls, f"{one.summary} ({one.distribution})".strip(), one)
+    return found
+
+
+def listed() -> dict[str, BackendSpec]:
+    """`known` without backends of others that can't be loaded: each is named in a warning."""
+    found = known()
+    for name in sorted(found.keys() - BACKENDS.keys()):
+        try:
+            class_of(name)
+        except BackendUnavailable as error:
+            logger.warning("skipped: %s", error)
+            del found[name]
+    return found
 
 
 def resolve_device(device: str | torch.device) -> torch.device:
@@ -142,7 +176,16 @@ def resolve_device(device: str | torch.device) -> torch.device:
 
 def availability(name: str, device: torch.device) -> str | None:
     """None if the backend can run on the device, else why not and what to do."""
-    return _backend_class(name).unavailable(device)
+    return _unavailable(class_of(name), device)
+
+
+def _unavailable(cls: type[Backend], device: torch.device) -> str | None:
+    try:
+        return cls.unavailable(device)
+    except Exception as error:
+        if cls.__module__.startswith("turbopi."):
+            raise
+        return f"its check of the device failed: {extensions.reason(error)}"
 
 
 def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
@@ -182,10 +225,10 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
-    cls = _backend_class(name)
+    cls = class_of(name)
     if precision not in cls.precisions:
         raise ConfigError(f"backend {name!r} runs in {' or '.join(cls.precisions)}, not in {precision!r}")
-    reason, what = cls.unavailable(device), "run"
+    reason, what = _unavailable(cls, device), "run"
     if precision in TIERS:
         if reason is not None and device.type != "cuda":
             format = format_of(precision)
@@ -216,17 +259,32 @@ def create(
     check(name, device, precision)
     more = {} if quantization is None else {"quantization": quantization}
     with preparing(device):
-        return _backend_class(name)(config, load, device=device, precision=precision, **more)
+        return class_of(name)(config, load, device=device, precision=precision, **more)
 
 
 def precisions(name: str) -> tuple[Precision, ...]:
     """The precisions a backend runs in."""
-    return _backend_class(name).precisions
+    return class_of(name).precisions
 
 
-def _backend_class(name: str) -> type[Backend]:
-    if name not in BACKENDS:
-        raise ConfigError(f"unknown backend {name!r}; choose one of {', '.join(BACKENDS)}, or 'auto'")
-    spec = BACKENDS[name]
+def class_of(name: str) -> type[Backend]:
+    """The backend's class. Raises ConfigError for an unknown name, BackendUnavailable for another's that is broken."""
+    spec = BACKENDS.get(name) or known().get(name)
+    if spec is None:
+        raise ConfigError(f"unknown backend {name!r}; choose one of {', '.join(known())}, or 'auto'")
+    if spec.extension is not None:
+        return _checked(spec.extension)
     cls: type[Backend] = getattr(importlib.import_module(spec.module), spec.cls)
+    return cls
+
+
+def _checked(extension: extensions.Extension) -> type[Backend]:
+    try:
+        cls: type[Backend] = extension.load()
+    except ConfigError as error:
+        raise BackendUnavailable(str(error)) from error
+    if missing := [member for member in _MEMBERS if not hasattr(cls, member)]:
+        raise BackendUnavailable(f"the {extension} is no backend: it lacks {', '.join(missing)}")
+    if cls.name != extension.name:
+        raise BackendUnavailable(f"the {extension} has the name {cls.name!r}; expected {extension.name!r}")
     return cls

@@ -1,7 +1,5 @@
 """Which protocols a backend has, found out once: `isinstance` of one takes 10 us, which every call would pay."""
 
-from collections.abc import Callable
-
 from turbopi.backends.base import Backend, Begins, Conditions, RunsBatches
 from turbopi.model.conditioning import Form
 
@@ -19,15 +17,3 @@ class Abilities:
     def forms(self) -> tuple[Form, ...]:
         """What the denoising loop can be asked for beside openpi's."""
         return () if self.conditions is None else self.conditions.forms
-
-
-class Held:
-    """The abilities of the backend that someone holds now: `backend` returns it, and later perhaps another one."""
-
-    def __init__(self, backend: Callable[[], Backend]) -> None:
-        self._backend, self._found = backend, Abilities(backend())
-
-    def __call__(self) -> Abilities:
-        if (backend := self._backend()) is not self._found.backend:
-            self._found = Abilities(backend)
-        return self._found

@@ -1,7 +1,7 @@
 """The command line.
 
 turbopi demo | infer | serve | view | bench | plan | calibrate | verify | eval |
-    compare | inspect | convert | export | build | tune | study | backends | doctor
+    compare | inspect | convert | export | build | tune | backends | doctor
 """
 
 from importlib import metadata
@@ -26,12 +26,12 @@ from turbopi.cli import (  # noqa: F401
     export,
     build,
     tune,
-    study,
     backends,
     doctor,
 )
 from turbopi.cli import process
-from turbopi.cli.framework import Commands, app
+from turbopi.cli.added import Commands
+from turbopi.cli.framework import app
 # isort: on
 
 __all__ = ["app", "main"]

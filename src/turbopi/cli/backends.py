@@ -37,7 +37,7 @@ def backends(
             "summary": spec.summary,
             "auto": spec.name == chosen,
         }
-        for spec in registry.BACKENDS.values()
+        for spec in registry.listed().values()
     ]
     table = Table(title=f"backends on {resolved}", title_justify="left")
     for column in ("backend", "available", "precisions", "what it is, or why it can't run and what to do"):

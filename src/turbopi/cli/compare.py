@@ -178,15 +178,14 @@ def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None
     Raises ConfigError for anything else.
     """
     from turbopi import backends
-    from turbopi.backends import BACKENDS
 
     parts = text.split(":")
     backend = parts[0]
     precision = parts[1] if len(parts) > 1 else options.precision_of(backend)
-    known = backend in BACKENDS and precision in backends.PRECISIONS
+    known = backend in backends.known() and precision in backends.PRECISIONS
     if not known or len(parts) > 3 or not all(re.fullmatch("[0-9]{1,9}", steps) for steps in parts[2:]):
         raise ConfigError(
             f"{text!r} is neither the folder of an evaluation nor a way to run: BACKEND[:PRECISION[:STEPS]], "
-            f"with a backend of {', '.join(BACKENDS)}, and {' or '.join(backends.PRECISIONS)}"
+            f"with a backend of {', '.join(backends.known())}, and {' or '.join(backends.PRECISIONS)}"
         )
     return backend, precision, int(parts[2]) if len(parts) > 2 else options.steps

@@ -16,7 +16,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +27,7 @@ from msgspec import Struct
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 from turbopi.cli.process import (
     BAD_INPUT,
@@ -125,13 +125,6 @@ class Command(TyperCommand):
         return without_types(super().get_params(ctx))
 
 
-class Commands(TyperGroup):
-    """All commands; likewise."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        return without_types(super().get_params(ctx))
-
-
 def without_types(params: list[Any]) -> list[Any]:
     """The same options, and nothing in --help's column of types for flags."""
     for param in params:
@@ -149,44 +142,75 @@ class CheckpointThen(Command):
         return ["[OPTIONS]", "[CHECKPOINT]", self.other]
 
 
+@dataclass(frozen=True)
+class Described:
+    """A function as a command: `run` has the options that typer reads."""
+
+    run: Callable[..., None]
+    cls: type[Command]
+    help: str
+    epilog: str | None
+
+    def declare(self, to: typer.Typer, name: str) -> None:
+        to.command(name, cls=self.cls, help=self.help, epilog=self.epilog)(self.run)
+
+
 def command(
     name: str, *, examples: Sequence[str], shared: type | None = None, cls: type[Command] = Command
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Declare a function as `turbopi <name>`.
+    """Declare a function as `turbopi <name>`, as `describe` has it."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        described = describe(function, examples=examples, shared=shared, cls=cls)
+        described.declare(app, name)
+        return described.run
+
+    return decorate
+
+
+def describe(
+    function: Callable[..., None],
+    *,
+    examples: Sequence[str] = (),
+    shared: type | None = None,
+    cls: type[Command] = Command,
+    owner: str = "Turbo-Pi's own",
+) -> Described:
+    """A function with typer's annotations as a command.
 
     examples   command lines for the end of its --help
     shared     a dataclass whose annotated fields become options; the function gets an instance as `options`
     cls        for another usage line
+    owner      whose code it is, for the message of a fault
     """
     shared_fields = fields(shared) if shared is not None else ()
 
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        @functools.wraps(function)
-        def run(*, debug: bool, **values: object) -> None:
-            given = dict(values)
-            if shared is not None:
-                values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
+    @functools.wraps(function)
+    def run(*, debug: bool, **values: object) -> None:
+        given = dict(values)
+        if shared is not None:
+            values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
 
-            def work() -> None:
-                _refuse_nan(given)
-                function(**values)
+        def work() -> None:
+            _refuse_nan(given)
+            function(**values)
 
-            with_errors_told(work, debug=debug)
+        with_errors_told(work, debug=debug, owner=owner)
 
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        own = [p.replace(kind=keyword) for p in inspect.signature(function).parameters.values() if p.name != "options"]
-        injected = [
-            inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
-            for field in shared_fields
-        ]
-        parameters = [*own, *injected, inspect.Parameter("debug", keyword, default=False, annotation=_Debug)]
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in parameters}
-        del run.__wrapped__  # or typer would read the undecorated signature
-        app.command(name, cls=cls, help=_unwrapped(function), epilog=_epilog(examples))(run)
-        return run
-
-    return decorate
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    own = inspect.signature(function, eval_str=True).parameters.values()
+    injected = [
+        inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type) for field in shared_fields
+    ]
+    parameters = [
+        *(parameter.replace(kind=keyword) for parameter in own if parameter.name != "options"),
+        *injected,
+        inspect.Parameter("debug", keyword, default=False, annotation=_Debug),
+    ]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    del run.__wrapped__  # or typer would read the undecorated signature
+    return Described(run, cls, _unwrapped(function), _epilog(examples) if examples else None)
 
 
 def _refuse_nan(values: Mapping[str, object]) -> None:
@@ -207,8 +231,8 @@ def _epilog(examples: Sequence[str]) -> str:
     return "\n\n".join(["[bold]Examples[/]", *lines])
 
 
-def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
-    """Run a command; an error becomes one red line on stderr and an exit code, and only our faults a traceback."""
+def with_errors_told(work: Callable[[], None], *, debug: bool, owner: str = "Turbo-Pi's own") -> None:
+    """Run a command; an error becomes one red line on stderr and an exit code, and a fault of `owner` a traceback."""
     rich.reconfigure(stderr=True)  # progress bars of the library use rich's own console
     log_to_stderr()
     try:
@@ -225,7 +249,7 @@ def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
         if debug or message is None:
             traceback.print_exc()
         if message is None:
-            message = f"this is a fault of Turbo-Pi's own ({type(error).__name__}); please report it with the traceback"
+            message = f"this is a fault of {owner} ({type(error).__name__}); please report it with the traceback"
         console = new_console(stderr=True)
         console.print(f"[bold red]error:[/] {escape(_shortened(message))}", highlight=False, soft_wrap=True)
         raise typer.Exit(_exit_code(error)) from None

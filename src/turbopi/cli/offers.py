@@ -1,6 +1,5 @@
 """What a policy will offer, told from its configuration and backend before minutes of loading its weights."""
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -28,18 +27,17 @@ def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
     """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
     from turbopi import backends
     from turbopi.arguments import Denoising
-    from turbopi.backends.abilities import Held
+    from turbopi.backends.abilities import Abilities
     from turbopi.joining import Joining
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     name = backends.choose(device, precision)[0] if fitting.backend == "auto" else fitting.backend  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
-    spec = backends.BACKENDS[name]
-    kind: Any = getattr(importlib.import_module(spec.module), spec.cls)  # a class has its instances' capabilities
+    kind: Any = backends.class_of(name)  # a class has its instances' capabilities
     asked = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
     no_pipeline: Any = None  # no observation is read
-    modes = Joining(checkpoint.config, no_pipeline, Held(lambda: kind), asked.integration).modes
+    modes = Joining(checkpoint.config, no_pipeline, Abilities(kind), asked.integration).modes
     batches = isinstance(kind, backends.RunsBatches) and (asked.integration is None or asked.integration.is_euler)
     return Offers(
         real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},

@@ -176,7 +176,8 @@ def own_precision(names: Sequence[str]) -> str:
     """bf16, unless none of the backends runs in it: then the first one's first. "auto" and unknown ones run in bf16."""
     from turbopi import backends
 
-    own = [backends.precisions(name) if name in backends.BACKENDS else ("bf16",) for name in names]
+    known = backends.BACKENDS if set(names) <= {"auto", *backends.BACKENDS} else backends.known()
+    own = [backends.precisions(name) if name in known else ("bf16",) for name in names]
     return "bf16" if not own or any("bf16" in one for one in own) else own[0][0]
 
 

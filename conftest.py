@@ -1,0 +1,127 @@
+"""What the tests of Turbo-Pi and of turbopi-lab share: the golden folder and models built from it."""
+
+import json
+import os
+import sys
+import tempfile
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import gpu_evidence
+import numpy as np
+import pytest
+import torch
+from distributions import install
+from matplotlib.figure import Figure
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
+
+from turbopi.config import Kind
+from turbopi.model.reference import FloatPrecision, Pi0Model
+from turbopi.verify.golden import Case, GoldenFolder
+
+ROOT = Path(__file__).parent
+GOLDEN = ROOT / "tests" / "golden"
+LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
+install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
+sys.path.insert(0, LAB.name)
+torch.set_num_threads(2)
+
+
+def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
+    """A GPU test of kernels that are written for compute capability 9.0."""
+    other = torch.cuda.is_available() and torch.cuda.get_device_capability() != (9, 0)
+    return pytest.mark.gpu(pytest.mark.skipif(other, reason="needs compute capability 9.0")(test))
+
+
+def gpu_or_interpreter() -> list[pytest.MarkDecorator]:
+    """Of a file of Triton kernels and their twins: one claim, two ways to check it. Scripts that pick `-m gpu` on a GPU
+    find these tests there; the interpreter is NumPy, which warns of infinities and turns arrays of one element into
+    numbers.
+    """
+    if torch.cuda.is_available():
+        return [pytest.mark.gpu]
+    return [pytest.mark.filterwarnings(f"ignore::{warning}") for warning in ("RuntimeWarning", "DeprecationWarning")]
+
+
+def packed_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a packed archive by name: one run of bytes, in which equal arrays lie once, and where each is."""
+    with np.load(path) as file:
+        index, data = json.loads(file["index"].tobytes()), file["data"].tobytes()
+    places = ((name, np.dtype(kind), shape, at) for name, (kind, shape, at) in index.items())
+    return {name: np.frombuffer(data, kind, int(np.prod(shape)), at).reshape(shape) for name, kind, shape, at in places}
+
+
+@lru_cache
+def golden_folder() -> GoldenFolder:
+    return GoldenFolder(GOLDEN)
+
+
+@lru_cache
+def golden_cases() -> dict[str, Case]:
+    return {case.name: case for case in golden_folder().cases()}
+
+
+@lru_cache
+def golden_model(kind: Kind, precision: FloatPrecision = "f32") -> Pi0Model:
+    checkpoint = golden_folder().checkpoint(kind)
+    return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
+
+
+@pytest.fixture(autouse=True)
+def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the user's cache remembers of weights stays out of tests."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
+
+
+# Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
+QUICK = (
+    *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
+    *("test_launch_geometry", "test_recent_loops", "test_tools_mutate"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.stem in QUICK and item.get_closest_marker("gpu") is None:
+            item.add_marker(pytest.mark.quick)
+
+
+@pytest.fixture(scope="session")
+def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where CUDA kernels are kept, so that each is compiled once a session."""
+    return tmp_path_factory.mktemp("cubins")
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that were saved, in order: what they show can be compared with what they are to show."""
+    figures: list[Figure] = []
+    save = Figure.savefig
+
+    def keeping(self: Figure, *args: Any, **options: Any) -> None:
+        figures.append(self)
+        save(self, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", keeping)
+    return figures
+
+
+@pytest.fixture(scope="session")
+def golden() -> Path:
+    return GOLDEN
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say at the end of every run that the GPU tests weren't run on this code, if that is so."""
+    waiting = gpu_evidence.pending()
+    if waiting is not None:
+        terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
+        terminalreporter.line(f"since {waiting.date}: {waiting.reason}. Run scripts/gpu_check on a Hopper GPU.")
