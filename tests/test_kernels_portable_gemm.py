@@ -245,10 +245,9 @@ def test_damage_that_int8_cannot_hold_shows_in_its_row_of_the_stream(damage: flo
     bias[5] = damage
     gated.scale[5] = damage
     every = list(range(8))
-    tile = {"tile": SMALL[0]}
     for ours, twin, rows in (
-        (lambda s: product(numbers, matrix, "gelu", bias, stream=s, **tile, **to), plain.linear_gelu, every),
-        (lambda s: product(numbers, gated, "geglu", stream=s, **tile, **to), plain.linear_geglu, every),
+        (lambda s: product(numbers, matrix, "gelu", bias, stream=s, tile=SMALL[0], **to), plain.linear_gelu, every),
+        (lambda s: product(numbers, gated, "geglu", stream=s, tile=SMALL[0], **to), plain.linear_geglu, every),
     ):
         given = (numbers, matrix, bias) if twin is plain.linear_gelu else (numbers, gated)
         assert marked(ours) == marked(lambda s, twin=twin, given=given: twin(*given, **to, stream=s)) == rows  # type: ignore[misc]
@@ -260,8 +259,8 @@ def test_damage_that_int8_cannot_hold_shows_in_its_row_of_the_stream(damage: flo
         assert stream[:, 0].isnan().nonzero().flatten().tolist() == [3], "its other numbers hide it"
         stream, _ = normed(random(8, 32), None, None, bias.float(), None, 1e-6, **to)
         assert stream[:, 0].isnan().all()
-    for normed in (norms.residual_layer_norm, plain.residual_layer_norm):
-        stream, _ = normed(bad(3, 7, 8, 32), random(8, 32), ones(32), ones(32), 1e-6, **to)
+    for layer_norm in (norms.residual_layer_norm, plain.residual_layer_norm):
+        stream, _ = layer_norm(bad(3, 7, 8, 32), random(8, 32), ones(32), ones(32), 1e-6, **to)
         assert stream[:, 0].isnan().nonzero().flatten().tolist() == [3]
     for prefix in (attend, plain.attention):  # two heads of four tokens; the values are the cache's rows
         values, queries = random(4, 16), bad(5, 7, 8, 16)

@@ -115,7 +115,8 @@ def test_what_is_forgotten_is_freed() -> None:
 
 
 def test_a_loop_of_its_own_outlives_a_solvers_loop_with_the_same_evaluation() -> None:
-    backend, gone = on_cpu(cls=Unrun), []
+    backend = on_cpu(cls=Unrun)
+    gone: list[Loop] = []
     backend._forget = gone.append  # type: ignore[method-assign, assignment]
     integration = Integration("ab2", (1.0, 0.5, 0.0))
     solver = Loop(2, 7, "solver", integration.evaluated, integration)
@@ -139,7 +140,8 @@ class OutOfMemory(Unrun):
 
 
 def test_what_failed_to_be_captured_is_not_called_warm() -> None:
-    backend, (observation, noise) = on_cpu(cls=OutOfMemory), observations("pi05", [1, 1], [3, 3], 7)
+    backend: Any = on_cpu(cls=OutOfMemory)
+    observation, noise = observations("pi05", [1, 1], [3, 3], 7)
     alone = made_up("pi05", 1, 5)
     for _ in range(2):
         with pytest.raises(torch.OutOfMemoryError):
@@ -157,7 +159,8 @@ def test_what_failed_to_be_captured_is_not_called_warm() -> None:
 
 def test_batches_of_all_sizes_have_their_rows_in_the_same_buffers() -> None:
     """And each observation gets what it gets alone, whichever sizes ran before."""
-    backend, expected = on_cpu(cls=Unrun), {}
+    backend = on_cpu(cls=Unrun)
+    expected: dict[int, Tensor] = {}
     batches = {count: observations("pi05", [1] * count, [3] * count, 7) for count in (4, 2)}
     for _ in range(2):
         for count, (observation, noise) in batches.items():

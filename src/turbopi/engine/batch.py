@@ -51,13 +51,14 @@ class SharedRows:
     """
 
     def __init__(self, config: ModelConfig, dtype: torch.dtype, device: torch.device) -> None:
-        self._config, self._options = config, {"dtype": dtype, "device": device}
+        self._config = config
         self._cache = Cache.allocate(config, 0, device, dtype)
-        self._embs = self._pictures = torch.empty(0, config.vlm.width, **self._options)  # type: ignore[arg-type]
+        self._embs = self._pictures = torch.empty(0, config.vlm.width, dtype=dtype, device=device)
 
     def cache(self, rows: int) -> Cache:
         if rows > (has := self._cache.k.shape[1]):
-            self._cache = Cache.allocate(self._config, max(rows, 2 * has), **self._options)  # type: ignore[arg-type]
+            like = self._embs
+            self._cache = Cache.allocate(self._config, max(rows, 2 * has), like.device, like.dtype)
         return Cache(self._cache.k[:, :rows], self._cache.v[:, :rows])
 
     def embs(self, rows: int) -> Tensor:
