@@ -84,7 +84,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
 
 
 def test_random_weights_are_said_to_be_random_and_held_to_the_closer_bound(tmp_path: Path) -> None:
-    result = turbopi("demo", "--random-weights", "pi05_tiny", "--frames", 1, "--report", tmp_path)
+    result = turbopi("demo", "--random-weights", "pi05_tiny", "--frames", 1, "--steps", 2, "--report", tmp_path)
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n")
     assert "The bound is 5 times the control" in result.stdout
@@ -98,7 +98,7 @@ def test_episodes_that_are_asked_for_without_a_simulator_are_refused(tmp_path: P
     monkeypatch.setattr(LiberoSimulator, "check", missing)
     result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--episodes", 1)
     assert refusal(result) == "LIBERO isn't installed here", "before a policy is made"
-    told = turbopi("demo", "--frames", 1, "--report", tmp_path)
+    told = turbopi("demo", "--frames", 1, "--steps", 1, "--report", tmp_path)
     assert told.exit_code == 0, told.output
     assert "The policy didn't act in the simulator: LIBERO isn't installed here" in " ".join(told.stdout.split())
 
@@ -115,7 +115,7 @@ RIGHT_SAMPLE = PyTorchBackend.sample
 
 def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(PyTorchBackend, "sample", swapped_cameras)
-    result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--json", "--episodes", 0)
+    result = turbopi("demo", "--frames", 1, "--steps", 2, "--report", tmp_path, "--json", "--episodes", 0)
     assert result.exit_code == 1, result.output
     assert "FAIL: pytorch bf16 is" in result.stderr
     assert "from the reference, beyond its bound" in result.stderr

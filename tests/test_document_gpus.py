@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from compile_for_all.document import Compiled, CompiledForAll, written
 from doc_tables import gpus as tables
 
 from turbopi import backends
@@ -73,13 +73,13 @@ def test_a_failed_check_is_no_run(tmp_path: Path) -> None:
 
 
 def test_compiled_kernels_are_counted_by_target(tmp_path: Path) -> None:
-    rows: list[dict[str, Any]] = [
-        {"kernel": "a", "variant": "1", "target": "sm_89"},
-        {"kernel": "b", "variant": "1", "target": "sm_89", "problem": "spills 400 bytes"},
-        {"kernel": "c", "variant": "1", "target": "sm_89", "refused": "Hopper's own"},
-        {"kernel": "a", "variant": "1", "target": "sm_120a"},
+    rows = [
+        Compiled("a", "1", "sm_89"),
+        Compiled("b", "1", "sm_89", problem="spills 400 bytes"),
+        Compiled("c", "1", "sm_89", refused="Hopper's own"),
+        Compiled("a", "1", "sm_120a"),
     ]
-    (tmp_path / tables.COMPILED).write_text(json.dumps({"rows": rows}))
+    (tmp_path / tables.COMPILED).write_text(written(CompiledForAll("2026-11-27", {}, rows)))
     found = tables.gpus(tmp_path)
     assert cells(found, "GeForce RTX 4090")["kernels compiled"] == "1 of 2"
     assert cells(found, "GeForce RTX 5090")["kernels compiled"] == "1"

@@ -44,6 +44,18 @@ def test_links_lead_to_files_and_headings(document: Path) -> None:
             assert anchor in headings(target), f"{link}: {target.name} has no such heading"
 
 
+_WITHOUT_A_FILE = re.compile(
+    r"\bno result files?\b|\bno files? (was|were) kept|\b(files?|outputs?) (wasn't|weren't|was not|were not) kept"
+)
+
+
+@pytest.mark.parametrize("document", blocks.documents(ROOT), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_no_figure_is_said_to_have_no_result_file(document: Path) -> None:
+    """A figure without a file is left out, or measured again."""
+    found = _WITHOUT_A_FILE.search(" ".join(document.read_text(encoding="utf-8").split()))
+    assert found is None, f"{found[0]!r}: expected a result file below benchmarks/results, or no figure"
+
+
 def headings(document: Path) -> set[str]:
     """The anchors that GitHub makes of a document's headings."""
     text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -138,31 +150,45 @@ def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
     assert len(drawn.stale_plots(root)) == 3
 
 
-def test_the_plot_beside_others_is_of_readmes_table_and_of_what_the_documents_say_of_others() -> None:
-    told = peers.read_peers(ROOT)
+def test_the_plot_beside_others_is_of_readmes_table() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert f"<!-- table: headline {told.ours} -->" in readme and peers.PLOT.as_posix() in readme
-    performance = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
-    (sentence,) = re.findall(r"Other programs with the same job.*?\n\n", performance, re.DOTALL)
-    assert sorted(float(ms) for ms in re.findall(r"\d+\.\d", sentence)) == sorted(peer.ms for peer in told.peers)
+    assert f"<!-- table: peers {' '.join(f'{peers.FOLDER.name}/{run}' for run in peers.RUNS)} -->" in readme
+    assert peers.PLOT.as_posix() in readme
     drawn = peers.bars(ROOT)
-    assert [name for name, _, ours in drawn if ours] == ["Turbo-Pi, FP8", "Turbo-Pi, bf16"]
-    for _, median, _ in (bar for bar in drawn if bar[2]):
-        assert f"**{median:.1f} ms**" in readme
-    assert (ROOT / peers.PLOT).stat().st_size < 60_000
+    assert [name for name, _ in drawn] == [*peers.DRAWN[:-1], "openpi, PyTorch compiled (on the GPU alone)"]
+    for name, ms in drawn:
+        (row,) = re.findall(rf"^\| {name.removesuffix(' (on the GPU alone)')} \|.*$", readme, re.MULTILINE)
+        assert f"| {ms:.2f} |" in row
+    assert (ROOT / peers.PLOT).stat().st_size < 20_000
 
 
 def test_the_plot_beside_others_is_drawn_anew_for_other_figures(tmp_path: Path) -> None:
-    root = project(tmp_path, "headline a/results.json")
-    assert peers.stale_peers(root) == []  # nothing to draw
-    (root / "docs").mkdir()
-    text = (ROOT / peers.PEERS).read_text().replace(peers.read_peers(ROOT).ours, "a/results.json")
-    (root / peers.PEERS).write_text(text)
-    assert len(peers.stale_peers(root)) == 1
-    assert peers.draw_peers(root) == [root / peers.PLOT]
-    assert peers.stale_peers(root) == [] == peers.draw_peers(root)
-    (root / peers.PEERS).write_text(text.replace("17.1", "17.2"))
-    assert len(peers.stale_peers(root)) == 1
+    assert peers.stale_peers(tmp_path) == []  # nothing to draw
+    (tmp_path / "docs").mkdir()
+    folder = tmp_path / peers.FOLDER
+    folder.mkdir(parents=True)
+    for file in (ROOT / peers.FOLDER).iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    assert len(peers.stale_peers(tmp_path)) == 1
+    assert peers.draw_peers(tmp_path) == [tmp_path / peers.PLOT]
+    assert peers.stale_peers(tmp_path) == [] == peers.draw_peers(tmp_path)
+    file = folder / "flashrt_openpi.jsonl"
+    file.write_text(file.read_text().replace("15.019", "15.029"))
+    assert len(peers.stale_peers(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.txt", "realtime-vla triton views=3 lang=48 H=10 steps=10: 22.71 ms\n", "has no job of 2 cameras"),
+        ("a.jsonl", '{"peer": "x", "setting": "y", "job": "z", "p50_ms": -1}\n', "line 1: p50_ms is -1"),
+        ("a.csv", "", "a peer's run is"),
+    ],
+)
+def test_an_output_of_another_job_or_kind_is_refused(name: str, text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=said):
+        peers.read_run(tmp_path / name)
 
 
 def test_tables_hold_the_numbers_of_their_job() -> None:

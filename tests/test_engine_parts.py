@@ -208,7 +208,11 @@ class TestPictures:
         assert bool(found[0].isfinite().all()) and torch.equal(*found)
 
     # the operation that stands in for the device's is openpi's way
-    @pytest.mark.parametrize(("cls", "resize"), [(OnCpu, "openpi"), (OnCpu, "lerobot"), (Resizing, "openpi")])
+    @pytest.mark.parametrize(
+        ("cut", "cls", "resize"),
+        [(1, OnCpu, "openpi"), (3, OnCpu, "lerobot"), (1, Resizing, "openpi")],
+        indirect=["cut"],
+    )
     def test_actions_are_those_of_one_part(
         self, cls: type[OnCpu], resize: ImageResize, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -216,21 +220,21 @@ class TestPictures:
         made, noise = observations("pi05", CAMERAS, [7, 12, 3, 1], horizon=5)
         side = made.images.shape[2]
         sizes = ((side, side), (30, 50), (side, side), (40, 20))
+        backends, single = {part: on_cpu("pi05", cls) for part in (100, 2)}, on_cpu()
         for seed in (0, 4):
             shown = [
                 [picture(*sizes[(row + camera) % 4], seed=seed + camera) for camera in range(count)]
                 for row, count in enumerate(CAMERAS)
             ]
             found = []
-            for part in (100, 2):
+            for part, backend in backends.items():
                 monkeypatch.setattr(call, "PART", part)
-                backend = on_cpu("pi05", cls)
                 begun = backend.begin_batch(shown, resize)
                 rows = [HostRow.of(made, row) for row in range(4)]
                 rest = [row.tokens for row in rows], np.stack([row.state for row in rows]), noise.numpy()
                 found.append(begun.finish(*rest, 2).actions)
             assert bool(found[0].isfinite().all()) and torch.equal(*found)
-            alone = on_cpu().begin([fitted(one, side, resize) for one in shown[2]])
+            alone = single.begin([fitted(one, side, resize) for one in shown[2]])
             theirs = alone.finish(rows[2].tokens, rows[2].state, noise[2].numpy(), 2).actions[0]
             torch.testing.assert_close(found[1][2], theirs, atol=2e-5, rtol=2e-5)
 
@@ -257,6 +261,7 @@ class TestPictures:
         with pytest.raises(AssertionError, match="5 things to do before 4 graphs"):
             graph.launch(*[lambda: None] * 5)
 
+    @pytest.mark.parametrize("cut", [1], indirect=True)
     def test_a_wrong_picture_of_a_later_part_leaves_the_next_call_right(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(call, "PART", 2)
         made, noise = observations("pi05", CAMERAS, [7, 12, 3, 1], horizon=5)

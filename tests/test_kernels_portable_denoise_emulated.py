@@ -134,14 +134,13 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
     assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
 
 
-@pytest.mark.parametrize("seed", [4, 5, 6])  # blocks stand still for a while, so that others run ahead
-def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.MonkeyPatch, folder: Path, seed: int) -> None:
+def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     p = problem("golden", 2, 10, 37, 1, CPU)
     packed = PackedExpert.pack(p.config, p.layers)
     first = run(p, packed, monkeypatch, folder, blocks=5)
-    assert all(
-        torch.equal(a, b) for a, b in zip(first, run(p, packed, monkeypatch, folder, blocks=5, seed=seed), strict=True)
-    )
+    for seed in (4, 5, 6):  # blocks stand still for a while, so that others run ahead
+        again = run(p, packed, monkeypatch, folder, blocks=5, seed=seed)
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True)), seed
 
 
 def test_blocks_that_wait_in_vain_give_up_and_say_where(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:

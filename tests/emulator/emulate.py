@@ -5,14 +5,17 @@ machine.h doesn't know is an error when it is translated, or where only a part o
 Slow (a product of 64 x 16 x 64 takes milliseconds) and not exact to the tensor cores' order of summation.
 """
 
+import atexit
 import ctypes
 import hashlib
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ from turbopi.kernels.sm90 import instructions
 
 COMPILER = shutil.which("g++")
 MACHINE = Path(__file__).with_name("machine.h")
+OPTIONS = ("-O1", "-std=c++17", "-w", "-fPIC")
 
 # What is in an asm statement's text -> the function of machine.h that does it; the first that fits.
 INSTRUCTIONS = (
@@ -141,13 +145,24 @@ def tensor_map(
     return made
 
 
+@lru_cache
+def _header() -> Path:
+    """machine.h beside its precompiled form, made once a process: to parse it takes longer than most kernels."""
+    folder = Path(tempfile.mkdtemp(prefix="machine-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    header = Path(shutil.copy(MACHINE, folder))
+    command = [COMPILER or "g++", *OPTIONS, "-x", "c++-header", header, "-o", f"{header}.gch"]
+    subprocess.run(command, capture_output=True)  # where it can't be made the header is parsed again
+    return header
+
+
 def compiled(
     source: str, name: str, takes: Parameters, defines: dict[str, int], folder: Path, in_part: bool = False
 ) -> Path:
     """A library with the kernel. in_part: see `translated`. Raises RuntimeError with the compiler's words."""
     kinds = ["TensorMap" if one.type == TENSOR_MAP else one.type for one in takes.all]
     call = ", ".join(f"machine::given<{kind}>(values[{i}])" for i, kind in enumerate(kinds))
-    text = f"""#include "{MACHINE}"
+    text = f"""#include "{MACHINE.name}"
 {translated(source, in_part)}
 extern "C" const char* run(int blocks, int threads, int cluster, int shared, int seed, void** values) {{
     static std::string why;
@@ -170,7 +185,7 @@ extern "C" const char* run(int blocks, int threads, int cluster, int shared, int
     file, library = folder / f"{key}.cpp", folder / f"{key}.so"
     if not library.exists():
         file.write_text(text)
-        command = [COMPILER or "g++", "-O1", "-std=c++17", "-w", "-shared", "-fPIC", *options]
+        command = [COMPILER or "g++", *OPTIONS, "-shared", f"-I{_header().parent}", *options]
         done = subprocess.run([*command, "-o", library, file], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"g++ doesn't compile {name}:\n{done.stderr[:4000]}")

@@ -9,12 +9,9 @@ from turbopi.errors import ConfigError
 from turbopi.reading import plain_document, read_document
 
 
-class Compiled(Struct, frozen=True, omit_defaults=True):
-    """One kernel for one target. problem: why it isn't fit to run there; refused: why it isn't to run there."""
+class _Found(Struct, frozen=True, omit_defaults=True):
+    """What a compiler says. problem: why it isn't fit to run there; refused: why it isn't to run there."""
 
-    kernel: str
-    variant: str
-    target: str
     registers: int = 0  # a thread
     spilled: int = 0  # bytes of a thread's stack
     shared: int = 0  # bytes a block
@@ -22,17 +19,51 @@ class Compiled(Struct, frozen=True, omit_defaults=True):
     refused: str | None = None
 
 
+class Compiled(Struct, frozen=True):
+    """One kernel for one target; the other fields are `_Found`'s."""
+
+    kernel: str
+    variant: str
+    target: str
+    registers: int = 0
+    spilled: int = 0
+    shared: int = 0
+    problem: str | None = None
+    refused: str | None = None
+
+
 class CompiledForAll(Struct, frozen=True):
-    """versions: of the compilers. rows: each kernel, variant and target once."""
+    """versions: of the compilers."""
 
     date: str
     versions: dict[str, str]
     rows: list[Compiled]
 
 
+class _Kernel(Struct, frozen=True):
+    kernel: str
+    variant: str
+    targets: dict[str, list[_Found]]  # several where the variant's name doesn't tell them apart
+
+
+class _File(Struct, frozen=True):
+    """As it lies on the disk: a kernel's and variant's names once, not for each target."""
+
+    date: str
+    versions: dict[str, str]
+    kernels: list[_Kernel]
+
+
 def read_compiled(file: Path) -> CompiledForAll:
     """Raises ConfigError for another file."""
-    return read_document(file, CompiledForAll, ConfigError)
+    document = read_document(file, _File, ConfigError)
+    rows = [
+        Compiled(one.kernel, one.variant, target, **structs.asdict(found))
+        for one in document.kernels
+        for target, several in one.targets.items()
+        for found in several
+    ]
+    return CompiledForAll(document.date, document.versions, rows)
 
 
 def replaced(before: CompiledForAll, now: CompiledForAll, targets: set[str], only: str) -> CompiledForAll:
@@ -53,7 +84,12 @@ def replaced(before: CompiledForAll, now: CompiledForAll, targets: set[str], onl
 
 
 def written(document: CompiledForAll) -> str:
-    """JSON with a line for each row: there are thousands."""
-    rows = ",\n".join(f"  {json.dumps(plain_document(row))}" for row in document.rows)
-    empty = json.dumps(plain_document(structs.replace(document, rows=[])), indent=1)
-    return empty.replace('"rows": []', f'"rows": [\n{rows}\n ]') + "\n"
+    """JSON with a line for each kernel and variant: there are hundreds."""
+    kernels: dict[tuple[str, str], dict[str, list[_Found]]] = {}
+    for row in document.rows:
+        found = {field: getattr(row, field) for field in _Found.__struct_fields__}
+        kernels.setdefault((row.kernel, row.variant), {}).setdefault(row.target, []).append(_Found(**found))
+    named = (plain_document(_Kernel(*names, targets)) for names, targets in kernels.items())
+    lines = ",\n".join(f"  {json.dumps(one)}" for one in named)
+    empty = json.dumps(plain_document(_File(document.date, document.versions, [])), indent=1)
+    return empty.replace('"kernels": []', f'"kernels": [\n{lines}\n ]') + "\n"

@@ -11,9 +11,9 @@ A table stands between two lines of a document, which name what it shows and of 
 
 `tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below
 benchmarks/results/ with a benchmark's results.json has them, and each names the document it was drawn of. README's plot
-of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names. The measured calls
-that predictions and fleet plans go by are those of the result files that benchmarks/measured.json names. Reports of
-studies have their Markdown and plots beside their report.json.
+of others' latency beside ours is drawn of the outputs that peers.py names. The measured calls that predictions and
+fleet plans go by are those of the result files that benchmarks/measured.json names. Reports of studies have their
+Markdown and plots beside their report.json.
 """
 
 import argparse

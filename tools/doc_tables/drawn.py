@@ -1,13 +1,17 @@
 """Plots of benchmark results, and of which document each was drawn."""
 
+import io
+from collections.abc import Iterable
 from pathlib import Path
 
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import DRAWN_OF, fingerprint, write_plots
 
 PLOTS = ("stages.png", "roofline.png", "steps.png")
+COLOURS = 128  # of a checked-in plot: a third of the bytes, and the same to the eye
 
 
 def _benchmarks(root: Path) -> list[tuple[Path, BenchDocument]]:
@@ -23,7 +27,28 @@ def draw(root: Path) -> list[Path]:
     for folder, document in _benchmarks(root):
         if any((folder / name).relative_to(root).as_posix() in stale for name in PLOTS):
             written += write_plots(document, folder)
-    return written
+    return compacted(written)
+
+
+def compacted(files: Iterable[Path]) -> list[Path]:
+    """Rewrite every PNG of `files` with a palette of its own, with its texts; returns all of them."""
+    files = list(files)
+    for file in files:
+        if file.suffix != ".png":
+            continue
+        texts, stream = PngInfo(), io.BytesIO()
+        with Image.open(file) as image:
+            for name, text in image.info.items():
+                if isinstance(text, str):
+                    texts.add_text(name, text)
+            rgba = image.convert("RGBA")
+        if rgba.getextrema()[3] == (255, 255):
+            plot = rgba.convert("RGB").quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        else:
+            plot = rgba.quantize(COLOURS, Image.Quantize.FASTOCTREE)
+        plot.save(stream, "png", optimize=True, pnginfo=texts)
+        file.write_bytes(stream.getvalue())
+    return files
 
 
 def stale_plots(root: Path) -> list[str]:

@@ -14,6 +14,8 @@ from pathlib import Path
 from unittest.mock import patch
 
 import torch
+from compile_for_all.document import read_compiled
+from msgspec import structs
 
 from turbopi import backends
 from turbopi.backends import Precision
@@ -96,8 +98,10 @@ def ran_as_ptx(gpu: GpuSpec, results: Path) -> str:
 def compiled_for(gpu: GpuSpec, results: Path) -> str:
     """How many kernels are fit for a GPU, of those that are meant for it."""
     number = gpu.capability[0] * 10 + gpu.capability[1]
-    mine = [row for row in rows_of(results / COMPILED) if target_number(row) == number and not row.get("refused")]
-    return counted(mine) or "no"
+    if not (results / COMPILED).is_file():
+        return "no"
+    rows = (structs.asdict(row) for row in read_compiled(results / COMPILED).rows if not row.refused)
+    return counted([row for row in rows if target_number(row) == number]) or "no"
 
 
 def target_number(row: dict[str, object]) -> int:

@@ -1,50 +1,132 @@
-"""README's plot of our latency beside others': ours from a result file, theirs from benchmarks/peers.json."""
+"""Our latency beside other programs': README's table and plot, both from the outputs in h200_2026-11-28_peers/.
+
+A run is one file as its program wrote it: ours a benchmark (.json), the others a JSON object a line (.jsonl) or a line
+of text each (.txt). What was built how: the README beside them.
+"""
 
 import hashlib
 import json
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 from matplotlib.figure import Figure
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 from PIL import Image
 
-from turbopi.bench.document import BenchDocument, read_benchmark
-from turbopi.bench.plots import DRAWN_OF, fingerprint
+from doc_tables.drawn import compacted
+from turbopi.bench.document import read_benchmark
+from turbopi.bench.plots import DRAWN_OF
+from turbopi.bench.work import Job
 from turbopi.errors import ConfigError
 from turbopi.plots import MEASURED, MUTED, write_figure
-from turbopi.reading import plain_document, read_document
+from turbopi.reading import as_document
 
-PEERS, PLOT = Path("benchmarks") / "peers.json", Path("docs") / "latency.png"
+FOLDER = Path("benchmarks") / "results" / "h200_2026-11-28_peers"
+RUNS = ("ours_beside_flashrt_openpi.json", "flashrt_openpi.jsonl", "realtime_vla.txt", "lerobot.jsonl")
+PLOT = Path("docs") / "latency.png"
 TEXT = "#7d8590"  # legible on white and on black: the background is the page's
-OURS = (("fused", "fp8", "Turbo-Pi, FP8"), ("fused", "bf16", "Turbo-Pi, bf16"))
+
+WHOLE, DEVICE = "whole call", "on the GPU"
+Key = tuple[str, str, str, int]  # program, setting, WHOLE or DEVICE, horizon
+Milliseconds = Mapping[Key, float]  # medians of one job: Pi0.5 of full size, 2 cameras, 48 prompt tokens, 10 steps
+
+# name in the documents -> (program, setting), as the outputs name them
+SHOWN = {
+    "Turbo-Pi, FP8": ("turbopi", "fp8"),
+    "Turbo-Pi, bf16": ("turbopi", "bf16"),
+    "FlashRT, FP8": ("flashrt", "fp8 nt_autotune=force"),
+    "FlashRT, bf16": ("flashrt", "bf16"),
+    "realtime-vla, bf16": ("realtime-vla", "triton"),
+    "openpi, PyTorch compiled": ("openpi-pytorch", "bf16 reduce-overhead"),
+    "LeRobot, PyTorch eager": ("lerobot", "bf16 eager"),
+    "openpi, PyTorch eager": ("openpi-pytorch", "bf16 eager"),
+}
+DRAWN = ("Turbo-Pi, FP8", "Turbo-Pi, bf16", "FlashRT, FP8", "FlashRT, bf16", "openpi, PyTorch compiled")
+
+_KINDS = {
+    "whole call, host uint8 to host actions": WHOLE,
+    "device tensors to device actions": DEVICE,
+    "graph replay": DEVICE,
+}
+_JOB = re.compile(r"(?P<kind>.*?) views=2( of 3)? lang=48( of 200)? H=(?P<horizon>\d+) steps=10")
+_LINE = re.compile(r"(?P<program>\S+) (?P<setting>\S+) views=2 lang=48 H=(?P<horizon>\d+) steps=10: (?P<ms>[\d.]+) ms")
 
 
-class Peer(Struct, frozen=True):
-    name: str
-    ms: Annotated[float, Meta(gt=0)]
-    how: str  # it was run
+class _Row(Struct, frozen=True):
+    peer: str
+    setting: str
+    job: str
+    p50_ms: Annotated[float, Meta(gt=0)]
 
 
-class Peers(Struct, frozen=True):
-    """Others' figures, measured by this project without keeping a result file."""
-
-    about: str
-    measured: str  # when, and on what
-    ours: str  # the result file of ours, below benchmarks/results
-    peers: list[Peer]
-
-
-def read_peers(root: Path) -> Peers:
-    return read_document(root / PEERS, Peers, ConfigError)
+def read_run(file: Path) -> Milliseconds:
+    """Medians of one run's jobs that the table has. Raises ConfigError, a ValueError, for a file without any."""
+    read = {".json": _ours, ".jsonl": _rows, ".txt": _lines}.get(file.suffix)
+    if read is None:
+        raise ConfigError(f"{file}: a peer's run is a .json, .jsonl or .txt file")
+    found = read(file)
+    if not found:
+        raise ConfigError(f"{file} has no job of 2 cameras, 48 prompt tokens and 10 steps; expected a run of a peer")
+    return found
 
 
-def bars(root: Path) -> list[tuple[str, float, bool]]:
-    """(name, milliseconds, whether it's ours), the fastest first."""
-    peers = read_peers(root)
-    document = _ours(root, peers)
-    ours = [(name, _median(document, backend, precision), True) for backend, precision, name in OURS]
-    return sorted([*ours, *((peer.name, peer.ms, False) for peer in peers.peers)], key=lambda bar: bar[1])
+def _ours(file: Path) -> dict[Key, float]:
+    document = read_benchmark(file)
+    job = Job()
+    return {
+        ("turbopi", result.precision, kind, result.job.horizon): result.milliseconds[name].p50
+        for result in document.results
+        if result.backend == "fused" and replace(result.job, horizon=job.horizon) == job
+        for kind, name in ((WHOLE, "total"), (DEVICE, "device"))
+    }
+
+
+def _rows(file: Path) -> dict[Key, float]:
+    found = {}
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        if line:
+            row = as_document(json.loads(line), _Row, f"{file}: line {number}", ConfigError)
+            job = _JOB.fullmatch(row.job)
+            if job and (kind := _KINDS.get(job["kind"])):
+                found[row.peer, row.setting, kind, int(job["horizon"])] = row.p50_ms
+    return found
+
+
+def _lines(file: Path) -> dict[Key, float]:
+    lines = (_LINE.fullmatch(line) for line in file.read_text(encoding="utf-8").splitlines())
+    return {(of["program"], of["setting"], DEVICE, int(of["horizon"])): float(of["ms"]) for of in lines if of}
+
+
+def peers(*runs: Milliseconds) -> list[str]:
+    """Each program: medians of whole calls and of the GPU's part alone, with chunks of 10 and of 50."""
+    every = {key: ms for run in runs for key, ms in run.items()}
+    lines = [f"| ms | {WHOLE}, H = 10 | H = 50 | {DEVICE}, H = 10 | H = 50 |", "|---|--:|--:|--:|--:|"]
+    for name, program in SHOWN.items():
+        cells = [every.get((*program, kind, horizon)) for kind in (WHOLE, DEVICE) for horizon in (10, 50)]
+        lines.append("| " + " | ".join([name, *("" if ms is None else _shown(ms) for ms in cells)]) + " |")
+    return lines
+
+
+def _shown(ms: float) -> str:
+    return f"{ms:.2f}" if ms < 100 else f"{ms:.0f}"
+
+
+# --- the plot ---------------------------------------------------------------------------------------------------------
+
+
+def bars(root: Path) -> list[tuple[str, float]]:
+    """(name, milliseconds) of the plot's programs with chunks of 10: a whole call, or else the GPU's part."""
+    every = {key: ms for run in RUNS for key, ms in read_run(root / FOLDER / run).items()}
+    found = []
+    for name in DRAWN:
+        whole, device = (every.get((*SHOWN[name], kind, 10)) for kind in (WHOLE, DEVICE))
+        ms = whole or device
+        assert ms is not None, f"{name} has no call with chunks of 10"
+        found.append((name if whole else f"{name} ({DEVICE} alone)", ms))
+    return found
 
 
 def draw_peers(root: Path) -> list[Path]:
@@ -56,44 +138,38 @@ def draw_peers(root: Path) -> list[Path]:
     figure.patch.set_alpha(0)
     ax = figure.add_subplot()
     ax.patch.set_alpha(0)
-    colors = [MEASURED if ours else MUTED for _, _, ours in drawn]
-    found = ax.barh([name for name, _, _ in drawn], [ms for _, ms, _ in drawn], color=colors, height=0.68)
-    ax.bar_label(found, [f"{ms:.1f} ms" for _, ms, _ in drawn], padding=4, color=TEXT, fontsize=10.5, weight="bold")
+    ours = [name.startswith("Turbo-Pi") for name, _ in drawn]
+    found = ax.barh(
+        [name for name, _ in drawn],
+        [ms for _, ms in drawn],
+        color=[MEASURED if mine else MUTED for mine in ours],
+        height=0.68,
+    )
+    ax.bar_label(found, [f"{_shown(ms)} ms" for _, ms in drawn], padding=4, color=TEXT, fontsize=10.5, weight="bold")
     ax.invert_yaxis()
     ax.margins(x=0.13, y=0.02)
     ax.set_xlabel("milliseconds a call, H = 10: less is better", color=TEXT, fontsize=10)
     ax.tick_params(colors=TEXT, labelsize=10.5, length=0)
-    for label, (_, _, ours) in zip(ax.get_yticklabels(), drawn, strict=True):
-        label.set_fontweight("bold" if ours else "normal")
+    for label, mine in zip(ax.get_yticklabels(), ours, strict=True):
+        label.set_fontweight("bold" if mine else "normal")
     for side in ax.spines.values():
         side.set_visible(False)
     write_figure(root / PLOT, figure, 150, about={DRAWN_OF: _fingerprint(root)})
-    return [root / PLOT]
+    return compacted([root / PLOT])
 
 
 def stale_peers(root: Path) -> list[str]:
     """One line if the plot is missing, or was drawn of other figures."""
-    if not (root / PEERS).is_file():
+    if not (root / FOLDER).is_dir():
         return []
     if not (root / PLOT).is_file():
         return [f"{PLOT.as_posix()}: there is no such plot; run scripts/tables"]
-    with Image.open(root / PLOT) as picture:
-        drawn_of = picture.info.get(DRAWN_OF)
+    with Image.open(root / PLOT) as image:
+        drawn_of = image.info.get(DRAWN_OF)
     if drawn_of != _fingerprint(root):
-        return [f"{PLOT.as_posix()}: drawn of other figures than {PEERS.as_posix()} and its result file have"]
+        return [f"{PLOT.as_posix()}: drawn of other figures than {FOLDER.as_posix()} has; run scripts/tables"]
     return []
 
 
-def _ours(root: Path, peers: Peers) -> BenchDocument:
-    return read_benchmark(root / "benchmarks" / "results" / peers.ours)
-
-
-def _median(document: BenchDocument, backend: str, precision: str) -> float:
-    (result,) = (one for one in document.main_results if (one.backend, one.precision) == (backend, precision))
-    return result.milliseconds["total"].p50
-
-
 def _fingerprint(root: Path) -> str:
-    peers = read_peers(root)
-    both = json.dumps([plain_document(peers), fingerprint(_ours(root, peers))], sort_keys=True)
-    return hashlib.sha256(both.encode()).hexdigest()
+    return hashlib.sha256(json.dumps(bars(root)).encode()).hexdigest()

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from doc_tables.drawn import compacted
 from turbopi.errors import ConfigError
 from turbopi.reading import read_document
 from turbopi_lab.studies import report
@@ -35,7 +36,7 @@ def write_reports(root: Path) -> list[Path]:
     """Write Markdown and plots of every report that needs them anew."""
     if not stale_reports(root):
         return []
-    return [path for folder, document in _reports(root) for path in report.write(document, folder)]
+    return compacted(path for folder, document in _reports(root) for path in report.write(document, folder))
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from doc_tables.fleet import sizing
 from doc_tables.gpus import gpu_predictions, gpu_refusals, gpus
+from doc_tables.peers import peers, read_run
 from doc_tables.studies import few_steps, read_report, study
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.bench.work import JOINS
@@ -355,4 +356,5 @@ TABLES = {
     **{lines.__name__: Table(_read_nothing, lines) for lines in (sizing, gpus, gpu_refusals, gpu_predictions)},
     "study": Table(read_report, study),
     "few_steps": Table(read_report, few_steps),
+    "peers": Table(read_run, peers),
 }

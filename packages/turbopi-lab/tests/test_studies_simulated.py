@@ -81,26 +81,21 @@ def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -
     assert "euler, uniform, 1, cut short after 1 of 2 episodes: `--way 'euler, uniform, 1'`" in found.not_run
 
 
-@pytest.mark.parametrize(
-    ("part", "name", "said"),
-    [
-        (("policy", "identity"), "weights", "the policy's weights differ: 'others' and '"),
-        (("protocol",), "replan", "the protocol's replan differ: 'others' and 5"),
-    ],
-)
-def test_cells_of_another_policy_or_protocol_are_not_compared(
-    part: tuple[str, ...], name: str, said: str, tmp_path: Path
-) -> None:
+def test_cells_of_another_policy_or_protocol_are_not_compared(tmp_path: Path) -> None:
     given = ("study", "steps_libero", *IN_CHASE, "--out", tmp_path, "--episodes-only", "--episodes", "1")
     assert turbopi(*given, "--way", "plain", "--way", "euler, uniform, 1").exit_code == 0
     plain, cell = (load_results(tmp_path / "episodes" / one) for one in ("plain", "euler_uniform_1"))
     _check_pair(plain, cell)
-    changed: Any = cell
-    for one in part:
-        changed = getattr(changed, one)
-    changed[name] = "others"
-    with pytest.raises(ConfigError, match=re.escape(f"can't be compared: {said}")):
-        _check_pair(plain, cell)
+    parts: list[tuple[Any, str, str]] = [
+        (cell.policy.identity, "weights", "the policy's weights differ: 'others' and '"),
+        (cell.protocol, "replan", "the protocol's replan differ: 'others' and 5"),
+    ]
+    for changed, name, said in parts:
+        before = changed[name]
+        changed[name] = "others"
+        with pytest.raises(ConfigError, match=re.escape(f"can't be compared: {said}")):
+            _check_pair(plain, cell)
+        changed[name] = before
 
 
 @pytest.mark.parametrize("name", ["kv_reuse_libero", "fp8_and_fp4_libero", "mask_libero"])
