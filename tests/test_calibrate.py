@@ -454,7 +454,9 @@ def test_a_file_for_int8_says_so_and_one_for_fp8_is_read_by_older_turbo_pis(tmp_
     int8.save(tmp_path / "q.json")
     read = Quantization.load(tmp_path / "q.json")
     assert read == int8 and read.identity == int8.identity != fp8.identity
-    assert set(read.plan(TINY, "int8").describe().values()) == {"int8"} and read.plan(TINY, "int8").expert == "int8"
+    plan = read.plan(TINY, "int8")
+    assert plan.expert == "int8" and plan.kept.keys() == {"prefix.5.qkv"} and "no NaN" in plan.kept["prefix.5.qkv"]
+    assert not fp8.plan(TINY, "fp8").kept, "whose NaN stays one"
     vision = read.only(["vision"]).plan(TINY, "int8")
     assert vision.kept["prefix.0.qkv"] == "INT8 is switched off in the prefix" and vision.expert == "bf16"
     for numbers in ("int4", 8):
@@ -650,7 +652,8 @@ def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
         "worst",
     }
     calibration = Quantization.load(out)
-    assert calibration.numbers == "int8" and not calibration.plan(TINY, "int8").kept
+    assert calibration.numbers == "int8" and calibration.plan(TINY, "int8").kept.keys() == {"prefix.5.qkv"}
+    assert str(calibration.sites["prefix.5.qkv"].kept).startswith("not possible: INT8 has no NaN")
     said = refusal(turbopi("calibrate", "--random-weights", "pi05_tiny", "--precision", "bf16", "--out", out, *quick))
     assert "--precision 'bf16' isn't what calibration is for; choose fp8 or int8" in said
 

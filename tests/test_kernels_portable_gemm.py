@@ -203,10 +203,10 @@ def test_parts_are_what_the_norms_add_up() -> None:
 def test_whatever_stands_before_a_product_leaves_in_its_numbers(format: Format) -> None:
     """Exactly as the twin rounds it, but where a sum's last bit decides."""
     x, qkv, ones = random(5, 96), random(8, 96), torch.ones(96, device=DEVICE, dtype=DTYPE)
-    keys, length = random(4, 16), torch.tensor([3], device=DEVICE)
+    keys, length = random(8, 16), torch.tensor([7], device=DEVICE)
     to: dict[str, Any] = {"inverse": format.largest / 9, "numbers": format.dtype}
     norm, layer_norm = (x, None, None, ones.float(), None, 1e-6), (x, x, ones, ones, 1e-6)
-    pictures, prefix = (qkv, 2, 2), (qkv.view(-1, 16), keys, keys, length, 4, 6)
+    pictures, prefix = (qkv, 2, 2), (qkv.view(-1, 16), keys, keys, length, 8, 6)
     for ours, twin in (
         (activations.geglu(x, **to), plain.as_input(plain.geglu(x.float()), DTYPE, **to)),
         (norms.residual_rms_norm(*norm, **to)[1], plain.residual_rms_norm(*norm, **to)[1]),

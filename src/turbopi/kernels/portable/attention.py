@@ -166,6 +166,7 @@ def prefix_attention(
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
+    assert out.dtype != torch.int8 or len(v) == len(out), "each token has a value to mark its damage in"
     tile = tile or chosen_tile(tiles, "prefix_attention", capability_of(q), rows // heads, heads, dim)
     _prefix_kernel[(triton.cdiv(rows, tile.rows),)](
         q, k, v, length, out, rows, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,

@@ -115,6 +115,7 @@ def packed_attention(
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
+    assert out.dtype != torch.int8 or len(v) == len(out), "each token has a value to mark its damage in"
     tile = tile or chosen_tile(tiles, "packed_attention", capability_of(q), rows // heads, heads, dim)
     assert tile.rows == PACKED_ROWS, f"{tile}: `segments.tiles` have {PACKED_ROWS} rows"
     _packed_kernel[(len(segments.tiles),)](
