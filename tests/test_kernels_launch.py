@@ -283,17 +283,19 @@ def compiler(monkeypatch: pytest.MonkeyPatch) -> Any:
     def install(known: tuple[int, ...] = (75, 80, 120), status: int = 0, build: str = "V13.0.88") -> list[list[str]]:
         compiled: list[list[str]] = []
 
-        def fill(program: Any, text: bytes) -> tuple[int]:
+        def fill(program: Any, text: Any) -> tuple[int]:
             ctypes.memmove(text, b"c" * len(text), len(text))
             return (0,)
+
+        def compile(program: Any, count: int, options: list[bytes]) -> tuple[Result]:
+            compiled.append([option.decode() for option in options])
+            return (Result(status),)
 
         fake = SimpleNamespace(
             nvrtcVersion=lambda: (0, 13, 0),
             nvrtcGetSupportedArchs=lambda: (0, list(known)),
             nvrtcCreateProgram=lambda *given: (0, object()),
-            nvrtcCompileProgram=lambda program, count, options: (
-                compiled.append([option.decode() for option in options]) or Result(status),
-            ),
+            nvrtcCompileProgram=compile,
             nvrtcResult=Result,
             nvrtcDestroyProgram=lambda program: (0,),
         )
@@ -384,7 +386,7 @@ def test_a_captured_graph_runs_on_when_its_kernel_is_let_go() -> None:
         kernels[-1].launch_cooperative(blocks, barrier.THREADS, args)
 
     kernels = [nvrtc.Kernel(code, "turbopi_barriers", 0)]
-    graph = Graph(run, None, torch.cuda.Stream(device))
+    graph = Graph(run, None, torch.cuda.Stream(device))  # type: ignore[no-untyped-call]
     kernels.clear()
     gc.collect()
     assert (code, device.index) in nvrtc._LOADED

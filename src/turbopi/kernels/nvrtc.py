@@ -160,11 +160,15 @@ class _Module:
 
 def _loaded(driver: Any, code: bytes) -> _Module:
     """The module of `code` on the current device."""
-    key = code, torch.cuda.current_device() if torch.cuda.is_initialized() else None
+    key = code, torch.cuda.current_device() if _initialized() else None
     module = _LOADED.get(key)
     if module is None:
         module = _LOADED[key] = _Module(driver, *key)
     return module
+
+
+def _initialized() -> bool:
+    return bool(torch.cuda.is_initialized())  # type: ignore[no-untyped-call]
 
 
 def _unload(driver: Any, module: Any, device: int | None) -> None:
@@ -178,7 +182,7 @@ def _unload_unused() -> None:
     The garbage collector may call this in any thread, at any line: it doesn't wait for a lock. A device that failed, or
     is gone, has lost its modules already.
     """
-    if torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+    if _initialized() and torch.cuda.is_current_stream_capturing():
         return
     if not _UNLOADING.acquire(blocking=False):
         return
