@@ -151,7 +151,7 @@ def _header() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="machine-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     header = Path(shutil.copy(MACHINE, folder))
-    command = [COMPILER or "g++", *OPTIONS, "-x", "c++-header", header, "-o", f"{header}.gch"]
+    command = [COMPILER or "g++", *OPTIONS, "-x", "c++-header", str(header), "-o", f"{header}.gch"]
     subprocess.run(command, capture_output=True)  # where it can't be made the header is parsed again
     return header
 
