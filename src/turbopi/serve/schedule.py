@@ -168,6 +168,10 @@ class Schedule:
         self._gaps: deque[float] = deque(maxlen=GAPS)
         self._returns = Returns()
         self._pauses = Pauses()
+        # When one was refused a place last: the numbers and sources of those that waited, and what it was.
+        self._line: list[int] = []
+        self._sources: frozenset[Hashable] = frozenset()
+        self._refused: tuple[Priority, int, float, float] | None = None
         self.crowded_until = -math.inf  # claims come before deadlines until then
 
     @property
@@ -193,13 +197,15 @@ class Schedule:
         refused = self._replace(request)
         if not request.continued and self.waiting >= self._places:
             self.crowded_until = now + CROWDED_SECONDS
-            gives_way = self._gives_way(request)
+            gives_way = request if self._no_better(request) else self._gives_way(request)
             text = f"busy: {self.queue_limit} requests wait already (--queue-limit {self.queue_limit}); try again"
             if gives_way is not request:
                 text += " later: this one gave its place to another that pauses longer, or is more urgent"
                 self._waiting.remove(gives_way)
             refused.append(Refused(gives_way, "busy", text))
             if gives_way is request:
+                if request.source not in self._sources:  # not for having more than its share
+                    self._refused = request.priority, request.level, request.deadline, request.served
                 return self._refuse(refused, now)
         self._waiting.append(request)
         if request.firm and request.priority == "robot":
@@ -252,6 +258,16 @@ class Schedule:
             self._pauses.replied(one.request.source, now)
         return refused
 
+    def _no_better(self, request: Request) -> bool:
+        """Whether it has no more claim than one that the same line refused: then it needs no closer look."""
+        if self._refused is None or request.source in self._sources:
+            return False
+        if [one.number for one in self._waiting] != self._line:
+            return False
+        priority, level, deadline, served = self._refused
+        same = request.priority == priority
+        return same and request.level >= level and request.deadline >= deadline and request.served >= served
+
     def _gives_way(self, request: Request) -> Request:
         """The one of a full line and a newcomer that gets no place; the module says by which rule."""
         some = [one for one in self._waiting if not one.continued]
@@ -259,6 +275,8 @@ class Schedule:
         if any(one.priority != request.priority for one in some):
             some = [one for one in some if one.priority == "simulator"]
         places = Counter([one.source for one in self._waiting])
+        self._line, self._sources = [one.number for one in self._waiting], frozenset(places)
+        self._refused = None
         places[request.source] += 1
         most = max([places[one.source] for one in some])
         if most > max(1, self._places // len(places)):
