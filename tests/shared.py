@@ -1,4 +1,4 @@
-"""What the tests of Turbo-Pi and of turbopi-lab share: the golden folder and models built from it."""
+"""What the tests of Turbo-Pi and of turbopi-lab share: the golden folder and models built from it, fixtures."""
 
 import json
 import os
@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import gpu_evidence
 import numpy as np
 import pytest
 import torch
@@ -26,7 +25,7 @@ from turbopi.config import Kind
 from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
-ROOT = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
 LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
@@ -81,19 +80,6 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
 
 
-# Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
-QUICK = (
-    *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
-    *("test_launch_geometry", "test_recent_loops", "test_tools_mutate"),
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.path.stem in QUICK and item.get_closest_marker("gpu") is None:
-            item.add_marker(pytest.mark.quick)
-
-
 @pytest.fixture(scope="session")
 def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where CUDA kernels are kept, so that each is compiled once a session."""
@@ -117,11 +103,3 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 @pytest.fixture(scope="session")
 def golden() -> Path:
     return GOLDEN
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say at the end of every run that the GPU tests weren't run on this code, if that is so."""
-    waiting = gpu_evidence.pending()
-    if waiting is not None:
-        terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
-        terminalreporter.line(f"since {waiting.date}: {waiting.reason}. Run scripts/gpu_check on a Hopper GPU.")
