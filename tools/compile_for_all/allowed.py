@@ -12,8 +12,9 @@ ALLOWED: dict[str, dict[int, int]] = {
     # Before the loop that multiplies, and behind it: two blocks shall fit a multiprocessor
     "sm90: way back": {90: 16},
     # What lives across a phase: the first weights and keys, asked for before the barrier, and addresses. 8.7 and 11.0
-    # have so few multiprocessors that a product takes several passes, with their addresses
-    "denoise.kernel": {80: 16, 86: 64, 87: 112, 89: 8, 90: 32, 100: 32, 103: 32, 110: 328, 120: 16, 121: 64},
+    # have so few multiprocessors that a product takes several passes, with their addresses. A barrier's looks, which
+    # its watchdog counts, are a register more: some targets spill more than without it, others less
+    "denoise.kernel": {80: 8, 86: 24, 87: 168, 90: 48, 100: 56, 103: 56, 110: 280, 120: 16, 121: 56},
     # Behind more than 16 tokens: RoPE of 32 of the suffix's keys, once a block. More than 8 bytes are of a tile of 64
     # rows, which only a measurement chooses
     "batch.suffix": {80: 16, 87: 8, 90: 8, 100: 8, 103: 8, 110: 8},

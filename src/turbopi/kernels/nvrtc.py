@@ -3,7 +3,7 @@
 NVRTC and the driver are called through `cuda.bindings`, which comes with PyTorch's CUDA builds.
 
 Kernels of the same code on the same device share one loaded module, which is unloaded when the last of them is gone.
-A CUDA graph needs the modules of what was captured: whoever captures holds the kernels that `capturing` lists.
+A CUDA graph needs the modules of what was captured: its owner holds the kernels that `capturing` lists.
 """
 
 import ctypes
