@@ -299,8 +299,8 @@ def test_a_policy_whose_later_chunks_dont_fit_ends_the_run_with_the_shape(tmp_pa
             results = super().infer_batch(observations, seed)
             return [{"actions": np.zeros(shape)}] if len(self.batches) > 1 else results
 
-    said = rf"actions of shape \[{shape[0]}, {shape[1]}\]; expected at least 5 actions of 7 numbers"
-    with pytest.raises(PolicyRefused, match=said):
+    expected = "at least 5 actions of 7 numbers" if shape[0] else r"\[horizon, width\]"
+    with pytest.raises(PolicyRefused, match=rf"shape \[{shape[0]}, {shape[1]}\]; expected {expected}"):
         run(tmp_path, Changing(), states=(0,))
     assert load_results(tmp_path).episodes == {}
 

@@ -42,7 +42,6 @@ BASES: dict[str, tuple[str, ...]] = {
     "plan": ("--robots", "3", "--hz", "20", "--horizon", "10", "--gpu", "h200"),
     "export": ("onnx", *_TINY, "{here}/onnx"),
     "build": _TINY,
-    "study": ("mask", *_TINY),
     "demo": (*_QUICK, "--frames", "1", "--episodes", "0", "--report", "{here}/report"),
     "view": ("{here}/nothing", "--save", "{here}/view.rrd"),
     "backends": (),
