@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from policy_helpers import policy_on
 from torch import Tensor
 
 from turbopi import UnifiedPolicy
@@ -82,21 +83,22 @@ CALLS: dict[str, Callable[[UnifiedPolicy, dict[str, Any]], dict[str, Any]]] = {
 }
 
 
-def answering(whole: UnifiedPolicy, kind: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Answering, Clock]:
+def answering(whole: UnifiedPolicy, kind: str) -> tuple[UnifiedPolicy, Answering, Clock]:
+    """A policy whose backend answers, that backend, and its clock."""
     clock = Clock()
     backend = Answering(whole.backend, kind, clock)
-    monkeypatch.setattr(whole, "backend", backend)
-    return backend, clock
+    made = policy_on(lambda *_, **__: backend, random_checkpoint("pi05_tiny"), num_denoising_steps=1)
+    return made, backend, clock
 
 
 @pytest.mark.parametrize("kind", CALLS)
 def test_waiting_for_ones_turn_is_in_no_other_time(
     whole: UnifiedPolicy, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, clock = answering(whole, kind, monkeypatch)
+    policy, _, clock = answering(whole, kind)
     for module in ("policy", "model_call"):
         monkeypatch.setattr(f"turbopi.{module}.time", SimpleNamespace(perf_counter=clock))
-    pipeline = whole.pipeline
+    pipeline = policy.pipeline
     first = "see" if kind == "begin" else "before"
     monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))
     monkeypatch.setattr(pipeline, "after_all", clock.passes(0.25, pipeline.after_all))
@@ -106,8 +108,8 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(whole._call, "lock", Lock())
-    timing = CALLS[kind](whole, whole.example_observation())["policy_timing"]
+    monkeypatch.setattr(policy._call, "lock", Lock())
+    timing = CALLS[kind](policy, policy.example_observation())["policy_timing"]
     stages = {f"{stage}_ms": milliseconds for stage, milliseconds in STAGES.items()}
     expected = {"preprocess_ms": 500.0, "queue_ms": 2000.0, "infer_ms": 1000.0, "postprocess_ms": 250.0}
     assert timing == pytest.approx(expected | stages | {"total_ms": sum(expected.values())})
@@ -115,40 +117,34 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("kind", CALLS)
-def test_actions_that_arent_finite_reach_nobody(
-    whole: UnifiedPolicy, kind: str, value: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_actions_that_arent_finite_reach_nobody(whole: UnifiedPolicy, kind: str, value: float) -> None:
     """Also in a column that the robot doesn't have."""
-    backend, _ = answering(whole, kind, monkeypatch)
-    obs = whole.example_observation()
-    assert np.isfinite(CALLS[kind](whole, obs)["actions"]).all()
+    policy, backend, _ = answering(whole, kind)
+    obs = policy.example_observation()
+    assert np.isfinite(CALLS[kind](policy, obs)["actions"]).all()
     backend.actions = torch.zeros(1, H, D)
     backend.actions[0, 4, 20] = backend.actions[0, 6, 2] = value
     with pytest.raises(ActionError) as refused:
-        CALLS[kind](whole, obs)
+        CALLS[kind](policy, obs)
     message = str(refused.value)
     assert f"2 of {H * D} numbers" in message and f"the first one, {value}, in row 4, column 20" in message
     assert all(place in message for place in ("checkpoint", "calibration", "turbopi verify"))
 
 
-def test_warmup_tells_of_such_actions_and_goes_on(
-    whole: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_warmup_tells_of_such_actions_and_goes_on(whole: UnifiedPolicy, caplog: pytest.LogCaptureFixture) -> None:
     """Its observation is made up; `verify` reports them."""
-    backend, _ = answering(whole, "sample", monkeypatch)
+    policy, backend, _ = answering(whole, "sample")
     backend.actions = torch.full((1, H, D), math.nan)
-    assert whole.warmup() > 0
+    assert policy.warmup() > 0
     assert f"{H * D} of {H * D} numbers aren't finite" in caplog.text
 
 
-def test_an_action_error_in_a_batch_names_the_observation(
-    whole: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    backend, _ = answering(whole, "sample", monkeypatch)
+def test_an_action_error_in_a_batch_names_the_observation(whole: UnifiedPolicy) -> None:
+    policy, backend, _ = answering(whole, "sample")
     backend.actions = torch.zeros(3, H, D)
     backend.actions[1, 0, 0] = math.nan
     with pytest.raises(ActionError, match=r"observation 1 of 3 \(from 0\): .* row 0, column 0"):
-        whole.infer_batch([whole.example_observation()] * 3, seed=0)
+        policy.infer_batch([policy.example_observation()] * 3, seed=0)
 
 
 @pytest.mark.parametrize("what", ["statistics", "outputs"])

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from policy_helpers import policy_on
 from torch import Tensor
 
 from turbopi import UnifiedPolicy
@@ -38,12 +39,16 @@ class Submitting:
         future.set_result(self._backend.sample(*arguments))
 
 
-def test_submitted_calls_give_what_infer_gives(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+def submitting(policy: UnifiedPolicy) -> tuple[UnifiedPolicy, Submitting]:
+    backend = Submitting(policy.backend)
+    return policy_on(lambda *_, **__: backend, random_checkpoint("pi05_tiny"), num_denoising_steps=2), backend
+
+
+def test_submitted_calls_give_what_infer_gives(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
     expected = [policy.infer(obs, seed=seed)["actions"] for seed, obs in enumerate(observations)]
-    backend = Submitting(policy.backend)
-    monkeypatch.setattr(policy, "backend", backend)
-    futures = [policy.submit(obs, seed=seed) for seed, obs in enumerate(observations)]
+    pipelined, backend = submitting(policy)
+    futures = [pipelined.submit(obs, seed=seed) for seed, obs in enumerate(observations)]
     assert not any(future.done() for future in futures) and len(backend.waiting) == 3
     for _ in futures:
         backend.answer()
@@ -53,10 +58,9 @@ def test_submitted_calls_give_what_infer_gives(policy: UnifiedPolicy, monkeypatc
         assert {"infer_ms", "preprocess_ms", "denoise_ms", "total_ms"} <= result["policy_timing"].keys()
 
 
-def test_a_backends_error_reaches_the_future(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = Submitting(policy.backend)
-    monkeypatch.setattr(policy, "backend", backend)
-    future = policy.submit(policy.example_observation(), seed=0)
+def test_a_backends_error_reaches_the_future(policy: UnifiedPolicy) -> None:
+    pipelined, backend = submitting(policy)
+    future = pipelined.submit(policy.example_observation(), seed=0)
     backend.waiting[0][0].set_exception(RuntimeError("device lost"))
     with pytest.raises(RuntimeError, match="device lost"):
         future.result(timeout=120)
@@ -72,9 +76,9 @@ def test_other_backends_say_so_or_run_at_once_if_asked(policy: UnifiedPolicy) ->
     assert future.done() and np.array_equal(future.result()["actions"], policy.infer(obs, seed=0)["actions"])
 
 
-def test_a_wrong_observation_is_refused_at_once(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy, "backend", Submitting(policy.backend))
+def test_a_wrong_observation_is_refused_at_once(policy: UnifiedPolicy) -> None:
+    pipelined, _ = submitting(policy)
     with pytest.raises(ObservationError):
-        policy.submit({}, seed=0)
+        pipelined.submit({}, seed=0)
     with pytest.raises(ObservationError, match="noise and seed were both given"):
-        policy.submit(policy.example_observation(), seed=0, noise=np.zeros((10, 32), np.float32))
+        pipelined.submit(policy.example_observation(), seed=0, noise=np.zeros((10, 32), np.float32))
