@@ -319,6 +319,10 @@ def test_a_named_tokenizer_that_cannot_be_read_is_never_replaced_in_silence(
     (tmp_path / "tokenizer").mkdir()
     with pytest.raises(TokenizerError, match=r"names the tokenizer in .*, which holds no tokenizer\.json or"):
         load_tokenizer(named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)
+    with pytest.raises(TokenizerError, match="names the tokenizer in"):
+        load_tokenizer(named=tmp_path / "tokenizer", candidates=[TINY_TOKENIZER], vocab_size=TINY_VOCAB)
+    cached = load_tokenizer(no_cache, named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)
+    assert cached.source == str(no_cache)  # given: it wins, wherever it lies
     (tmp_path / "tokenizer" / "tokenizer.json").write_text("{}")
     with pytest.raises(TokenizerError, match=r"tokenizer\.json: model is None; Turbo-Pi reads the byte-pair"):
         load_tokenizer(named=tmp_path / "tokenizer", vocab_size=TINY_VOCAB)

@@ -163,8 +163,8 @@ def load_tokenizer(
         there = [path for path in places if path.is_file()]
     else:
         there = [_given_file(Path(source).expanduser()), *(path for path in own if path.is_file())]
-    in_checkpoint = there[0] if there and there[0] != cached_tokenizer() else None
-    if own and in_checkpoint is None:
+    nearest = places[: places.index(own[-1]) + 1] if own else []  # nothing behind the named folder takes its place
+    if nearest and source is None and not any(path.is_file() for path in nearest):
         raise TokenizerError(
             f"the checkpoint names the tokenizer in {named}, which holds no {TOKENIZER_JSON} or {FILE_NAMES[0]}; "
             "is the download complete? Or give tokenizer="
