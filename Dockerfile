@@ -27,7 +27,7 @@ RUN case "$DEVICE" in \
 ARG EXTRAS=""
 COPY src ./src
 RUN pip install ".${EXTRAS:+[$EXTRAS]}" \
-    && ln -s "$(python -c 'from turbopi.shipped import SMALL_POLICY; print(SMALL_POLICY)')" /small_policy \
+    && ln -s "$(python -c 'from turbopi.policy.shipped import SMALL_POLICY; print(SMALL_POLICY)')" /small_policy \
     && useradd --create-home --uid 1000 robot \
     && install --directory --owner robot /home/robot/.cache
 

@@ -21,8 +21,8 @@ from typing import Any
 from websockets.sync.client import connect
 
 from turbopi import UnifiedPolicy, serve
-from turbopi.shipped import SMALL_POLICY, load_frames, observations
-from turbopi.wire import pack, unpack
+from turbopi.policy.shipped import SMALL_POLICY, load_frames, observations
+from turbopi.realtime.wire import pack, unpack
 
 
 def ask(url: str, seen: list[dict[str, object]]) -> Any:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from websockets.sync.client import ClientConnection, connect
 
-from turbopi.wire import pack, unpack
+from turbopi.realtime.wire import pack, unpack
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 HZ = 30

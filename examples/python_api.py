@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from turbopi import ObservationError, UnifiedPolicy
-from turbopi.shipped import SMALL_POLICY
+from turbopi.policy.shipped import SMALL_POLICY
 
 
 def main() -> None:

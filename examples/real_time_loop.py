@@ -13,8 +13,7 @@ import time
 
 import numpy as np
 
-from turbopi.client import RealTimeClient, ServerLost
-from turbopi.realtime import RealTimeExecutor
+from turbopi.realtime import RealTimeClient, RealTimeExecutor, ServerLost
 
 # What to command when there is no action. LIBERO's actions are movements, so the arm stays where it is with zeros; NaN
 # keeps the gripper's last command. For absolute positions leave hold_action out, and give the executor max_jump.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from turbopi.model.conditioning import (
+from turbopi.models.pi0.conditioning import (
     Conditioning,
     Guidance,
     GuidanceMode,

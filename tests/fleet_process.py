@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import CheckpointError, DeviceLost, ObservationError, TurboPiError
-from turbopi.running_chunk import RunningChunk
-from turbopi.serve import fleet, running
-from turbopi.serve.ray_app import build
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.serve import running
+from turbopi.serve.fleet import fleet
+from turbopi.serve.fleet.ray_app import build
+from turbopi.support.errors import CheckpointError, DeviceLost, ObservationError, TurboPiError
 
 NAME, HORIZON = "fakes", 10
 

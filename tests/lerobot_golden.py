@@ -12,8 +12,8 @@ import torch
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import open_checkpoint
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import ModelInputs, Observation
+from turbopi.models.observation import ModelInputs, Observation
+from turbopi.models.pi0.reference import Pi0Model
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 GOLDEN = Path(__file__).parent / "golden_lerobot"

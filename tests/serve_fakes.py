@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ActionError, DeviceLost, ObservationError
+from turbopi.support.errors import ActionError, DeviceLost, ObservationError
 
 OBSERVATION = {
     "observation/image": np.arange(12, dtype=np.uint8).reshape(2, 2, 3),

@@ -22,7 +22,7 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
 
 from turbopi.config import Kind
-from turbopi.model.reference import FloatPrecision, Pi0Model
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
 ROOT = Path(__file__).parents[1]

@@ -9,14 +9,14 @@ from conftest import golden_folder
 from torch import Tensor
 
 from turbopi.backends.base import LoadState
-from turbopi.backends.tensorrt import TensorRTBackend
+from turbopi.backends.tensorrt.backend import TensorRTBackend
+from turbopi.backends.tensorrt.cache import EngineCache, Environment
+from turbopi.backends.tensorrt.engine import Specification
+from turbopi.backends.tensorrt.engines import ModelEngines
+from turbopi.backends.tensorrt.ops import TORCH_DTYPES, TorchOps
 from turbopi.config import Kind
 from turbopi.engine.weights import Weights
-from turbopi.errors import BackendError
-from turbopi.tensorrt.cache import EngineCache, Environment
-from turbopi.tensorrt.engine import Specification
-from turbopi.tensorrt.engines import ModelEngines
-from turbopi.tensorrt.ops import TORCH_DTYPES, TorchOps
+from turbopi.support.errors import BackendError
 
 ENVIRONMENT = Environment("w" * 16, "tensorrt_rtx", "1.0", "A GPU", "9.0", "0.1.0", "code")
 

@@ -7,7 +7,7 @@ import torch
 
 from turbopi import backends
 from turbopi.backends.fused import FusedBackend
-from turbopi.errors import BackendUnavailable
+from turbopi.support.errors import BackendUnavailable
 
 GPU = torch.device("cuda", 0)
 

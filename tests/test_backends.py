@@ -11,8 +11,8 @@ from conftest import golden_cases, golden_folder
 
 from turbopi import backends
 from turbopi.backends.timing import StageTimer
-from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.model.reference import FloatPrecision
+from turbopi.models.pi0.reference import FloatPrecision
+from turbopi.support.errors import BackendUnavailable, ConfigError
 from turbopi.verify.check_golden import check_case
 
 CPU = torch.device("cpu")

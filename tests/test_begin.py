@@ -18,9 +18,9 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.config import Kind
 from turbopi.engine.graph import HEAD
 from turbopi.engine.runner import HostRow
-from turbopi.errors import BackendError, ObservationError
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
+from turbopi.support.errors import BackendError, ObservationError
 
 CPU = torch.device("cpu")
 

@@ -36,11 +36,11 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
 from turbopi.cli.options import own_precision
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels.nvrtc import bindings, compile_cubin
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import as_document
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, OutputError
+from turbopi.support.reading import as_document
 
 CPU = torch.device("cpu")
 CHECKED_IN = Path(__file__).parents[1] / "benchmarks/results/cpu_2026-11-21_small_policy_bench.json"

@@ -25,7 +25,7 @@ from turbopi.bench.predict import (
 )
 from turbopi.bench.work import Job, stage_work
 from turbopi.config import ModelConfig, preset
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 FULL = ModelConfig()

@@ -14,7 +14,7 @@ from conftest import golden_cases, golden_folder, golden_model
 from file_helpers import no_room
 from torch import nn
 
-from turbopi import backends, shipped
+from turbopi import backends
 from turbopi.calibrate import run
 from turbopi.calibrate.observations import read_examples, split
 from turbopi.calibrate.run import Settings, by_harm, calibrate_model
@@ -24,7 +24,19 @@ from turbopi.checkpoint.calibration import BESIDE, calibration_of, for_policy
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
-from turbopi.errors import (
+from turbopi.models.observation import ModelInputs
+from turbopi.models.pi0.layers import AdaRMSNorm
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears
+from turbopi.policy import shipped
+from turbopi.policy.examples import Example, NoisyExample, with_noises
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.quantization.calibration_file import VERSION, Quantization, SiteScale, shapes_of
+from turbopi.quantization.formats import FORMATS, FP8, Format
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions
+from turbopi.quantization.sites import PARTS, sites
+from turbopi.recordings import RecordedCall, save_call
+from turbopi.support.errors import (
     BackendUnavailable,
     CalibrationError,
     CheckpointError,
@@ -32,17 +44,6 @@ from turbopi.errors import (
     ObservationError,
     OutputError,
 )
-from turbopi.examples import Example, NoisyExample, with_noises
-from turbopi.model.layers import AdaRMSNorm
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears
-from turbopi.observation import ModelInputs
-from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.calibration_file import VERSION, Quantization, SiteScale, shapes_of
-from turbopi.quantization.formats import FORMATS, FP8, Format
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions
-from turbopi.quantization.sites import PARTS, sites
-from turbopi.recordings import RecordedCall, save_call
 from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
 from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.run import verify

@@ -11,7 +11,7 @@ import torch
 
 from turbopi.engine import graph
 from turbopi.engine.graph import CAPTURING, HEAD, Graph
-from turbopi.model import exact
+from turbopi.models.pi0 import exact
 
 
 class FakeStream(SimpleNamespace):

@@ -12,8 +12,8 @@ from checkpoint_helpers import GOLDEN, LIBERO, jax_copy, read_tree, torch_copy, 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.checkpoint.settings import parse_values
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, Normalization, RealTime, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.errors import CheckpointError, ConfigError
 
 PI05, PI0 = GOLDEN / "pi05" / "jax", GOLDEN / "pi0" / "jax"
 

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from turbopi.checkpoint import convert, open_checkpoint, random_checkpoint, write_random
 from turbopi.checkpoint.norm_stats import load_norm_stats
 from turbopi.config import PRESETS, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError, OutputError
+from turbopi.support.errors import CheckpointError, ConfigError, OutputError
 
 UNUSED = "paligemma_with_expert.gemma_expert.lm_head.weight"  # read by nothing, and zeros in what is written here
 

@@ -15,7 +15,7 @@ from checkpoint_helpers import GOLDEN, edit_json, edit_tensors, torch_copy, writ
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.checkpoint.names import to_openpi
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 
 @pytest.mark.parametrize("stack", ["paligemma_with_expert.gemma_expert.model.", "vision"])

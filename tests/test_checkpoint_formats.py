@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import Checkpoint, inspect_checkpoint, open_checkpoint
 from turbopi.config import PRESETS, PolicyConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.model.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.support.errors import CheckpointError, ConfigError
 
 P = "paligemma_with_expert.paligemma."
 TIED = (P + "lm_head.weight", P + "model.language_model.embed_tokens.weight")

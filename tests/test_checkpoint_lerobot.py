@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import PRESETS, GemmaConfig, Normalization, RealTime, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError, ObservationError
 from turbopi.robots import create_robot
+from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 EMBEDDING = "model__paligemma_with_expert__paligemma__model__language_model__embed_tokens__weight"

@@ -7,7 +7,7 @@ import pytest
 from checkpoint_helpers import GOLDEN, Tree, jax_copy, read_tree, write_json
 
 from turbopi.checkpoint import Checkpoint, open_checkpoint
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 LLM = "PaliGemma/llm/layers/"
 LAYER = 1  # of 3

@@ -19,7 +19,7 @@ from turbopi.checkpoint.norm_stats import (
     load_norm_stats,
 )
 from turbopi.config import Normalization
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 
 @pytest.mark.parametrize("name", ["full", "aloha", "droid", "libero", "no_quantiles"])

@@ -16,7 +16,7 @@ from lerobot_golden import GOLDEN, GoldenCase
 from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import convert, inspect_checkpoint, open_checkpoint
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 ADAPTER, CONFIG = "adapter_model.safetensors", "adapter_config.json"
 OUT, IN = "base_model.model.model.action_out_proj.", "base_model.model.model.action_in_proj."

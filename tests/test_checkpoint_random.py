@@ -8,9 +8,9 @@ import torch
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.random_weights import _BLOCK, _fill
 from turbopi.config import PRESETS
-from turbopi.errors import ConfigError
-from turbopi.model.reference import Pi0Model, parameter_dtype, parameter_shapes
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.support.errors import ConfigError
 
 PRESET = PRESETS["pi05_tiny"]
 SMALL = PRESET.with_model(vocab_size=64, vision=replace(PRESET.model.vision, depth=1))

@@ -20,9 +20,9 @@ from checkpoint_helpers import (
 from safetensors.torch import load_file
 
 from turbopi.checkpoint import convert, open_checkpoint
-from turbopi.errors import CheckpointError, ConfigError, TokenizerError
-from turbopi.model.reference import FloatPrecision
+from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.preprocess.tokenizer import load_tokenizer
+from turbopi.support.errors import CheckpointError, ConfigError, TokenizerError
 
 V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 

@@ -10,7 +10,7 @@ import pytest
 from cli_helpers import turbopi
 
 from turbopi.cli.files import check_folder
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 TINY = ("--random-weights", "pi05_tiny")
 PLAN = ("plan", "--hz", "50", "--horizon", "50")

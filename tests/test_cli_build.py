@@ -13,16 +13,16 @@ from conftest import golden_folder, golden_model
 from tensorrt_fakes import ENVIRONMENT, Twin
 
 from turbopi import backends
-from turbopi.backends.tensorrt import TensorRTBackend
-from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
-from turbopi.errors import BackendError, ConfigError
-from turbopi.installation import install_command
+from turbopi.backends.tensorrt import Library
+from turbopi.backends.tensorrt.backend import TensorRTBackend
+from turbopi.backends.tensorrt.cache import EngineCache
+from turbopi.backends.tensorrt.calibrate import Calibration, from_quantization
+from turbopi.backends.tensorrt.engine import Specification
+from turbopi.backends.tensorrt.engines import ModelEngines
+from turbopi.backends.tensorrt.fp8 import TensorRTFp8Backend
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale
-from turbopi.tensorrt import Library
-from turbopi.tensorrt.cache import EngineCache
-from turbopi.tensorrt.calibrate import Calibration, from_quantization
-from turbopi.tensorrt.engine import Specification
-from turbopi.tensorrt.engines import ModelEngines
+from turbopi.support.errors import BackendError, ConfigError
+from turbopi.support.installation import install_command
 
 TINY = ("--random-weights", "pi05_tiny", "--cameras", "2", "--prompt-tokens", "20", "--device", "cpu")
 
@@ -38,8 +38,8 @@ def build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., dict
         cache = EngineCache(folder, dataclasses.replace(ENVIRONMENT, weights=hashed))
         return ModelEngines(config, weights, cache, build=build_one, load=lambda one, plan: Twin(one), **more)
 
-    monkeypatch.setattr("turbopi.tensorrt.engines.for_this_gpu", engines)
-    monkeypatch.setattr("turbopi.tensorrt.library", lambda: Library("tensorrt_rtx", "1.0", None))
+    monkeypatch.setattr("turbopi.backends.tensorrt.engines.for_this_gpu", engines)
+    monkeypatch.setattr("turbopi.backends.tensorrt.library", lambda: Library("tensorrt_rtx", "1.0", None))
     monkeypatch.setattr("turbopi.backends.availability", lambda name, device: None)
 
     def run(*options: str) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def test_engines_of_another_calibration_are_refused_and_built_again(build: Calla
 
 def test_a_missing_modelopt_is_told_before_anything_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("turbopi.backends.availability", lambda name, device: None)
-    monkeypatch.setattr("turbopi.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("build", *TINY, "--precision", "fp8", "--method", "modelopt"))
     assert f"ModelOpt isn't installed; {install_command('modelopt')}, or" in said
 
@@ -144,7 +144,7 @@ def test_scales_from_noise_are_refused() -> None:
 def test_a_gpu_that_lacks_the_precision_is_refused(
     cls: type[TensorRTBackend], capability: tuple[int, int], said: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("turbopi.backends.tensorrt.missing", lambda: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.backend.missing", lambda: None)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     reason = cls.unavailable(torch.device("cuda", 0))
     assert (reason is None) if said is None else (reason is not None and said in reason)

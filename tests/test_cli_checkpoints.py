@@ -12,7 +12,7 @@ from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.shipped import FRAMES, load_frames
+from turbopi.policy.shipped import FRAMES, load_frames
 
 ARM = {
     "name": "my_arm",

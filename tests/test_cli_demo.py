@@ -11,17 +11,17 @@ import torch
 from cli_helpers import refusal, turbopi
 from PIL import Image
 
-from turbopi import demo, shipped
 from turbopi.backends.base import Sample
 from turbopi.backends.pytorch import PyTorchBackend, reference_model
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import BackendError, TurboPiError
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
-from turbopi.showing import action_groups
+from turbopi.models.observation import Observation
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.sim import SimulatorUnavailable
 from turbopi.sim.libero import LiberoSimulator
-from turbopi.verify import control
+from turbopi.support.action_groups import action_groups
+from turbopi.support.errors import BackendError, TurboPiError
+from turbopi.verify import control, demo
 
 
 def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:

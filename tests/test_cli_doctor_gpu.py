@@ -14,7 +14,7 @@ from turbopi.backends import Precision, tuned_tiles
 from turbopi.bench.measured import measured_calls
 from turbopi.cli import gpu_checkups
 from turbopi.cli.checkup import Row
-from turbopi.errors import BackendUnavailable
+from turbopi.support.errors import BackendUnavailable
 
 CAPABILITIES = [(8, 0), (8, 6), (8, 7), (8, 9), (9, 0), (10, 0), (11, 0), (12, 0)]
 ALL_CODE = ["sm_80", "sm_86", "sm_90", "sm_100", "sm_110", "sm_120"]
@@ -66,7 +66,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Fake:
         find = lambda name, *rest: None if name in lacking else object()  # noqa: E731
         monkeypatch.setattr("importlib.util.find_spec", find)
         monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
-        monkeypatch.setattr("turbopi.toolchain._missing_headers", lambda: None)
+        monkeypatch.setattr("turbopi.support.toolchain._missing_headers", lambda: None)
         monkeypatch.setattr(tuned_tiles, "driver_version", lambda: driver)
         monkeypatch.setattr(tuned_tiles, "cache_folder", lambda: cache)
 

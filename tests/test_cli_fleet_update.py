@@ -9,9 +9,9 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.cli.fleet_update import Asked, as_before, changes, of_the_front, runs, scale_of, scaled_as
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.serve_ray import robot_of
-from turbopi.errors import ConfigError
-from turbopi.serve.fleet import FleetOptions
+from turbopi.serve.fleet.fleet import FleetOptions
 from turbopi.serve.options import ServerOptions
+from turbopi.support.errors import ConfigError
 
 TINY = PolicyOptions(random_weights="pi05_tiny")
 FIRST = Asked(

@@ -24,9 +24,9 @@ from turbopi.cli import app
 from turbopi.cli.framework import Output, plain, with_errors_told
 from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import OF_POLICIES, OF_SERVERS, as_typed
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.serve import ServerOptions
+from turbopi.support.errors import ConfigError, ObservationError
 
 COMMANDS = (
     *(

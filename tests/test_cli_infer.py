@@ -14,9 +14,9 @@ from file_helpers import no_room
 from PIL import Image
 from typer.testing import Result
 
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 from turbopi.recordings import RecordedCall, save_call
-from turbopi.shipped import FRAMES, SMALL_POLICY, load_frames
 
 TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
 

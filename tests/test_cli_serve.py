@@ -23,17 +23,17 @@ from websockets.sync.client import connect
 
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
+from turbopi.cli.capabilities import offers_of
 from turbopi.cli.framework import Output
-from turbopi.cli.offers import offers_of
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.ports import why_not_free
-from turbopi.errors import ConfigError
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.observation import Observation
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.shipped import load_frames
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import iter_recording
 from turbopi.serve import running
-from turbopi.shipped import load_frames
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import ConfigError
 
 TINY = ("--random-weights", "pi05_tiny", "--steps", "2")
 

@@ -16,8 +16,8 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi import backends
 from turbopi.backends import tuned_tiles
 from turbopi.backends.tuned_tiles import Machine, find_tiles, read_tile_file, write_tile_file
-from turbopi.errors import DeviceLost
 from turbopi.kernels.tile_table import LIBRARY, Knobs, TileTable
+from turbopi.support.errors import DeviceLost
 from turbopi.tune import gpu, plan
 from turbopi.tune.race import Round
 from turbopi.tune.shapes import Operation

@@ -1,4 +1,4 @@
-"""turbopi.client: no answer is taken for another call's, no call waits for ever, only chunks get through."""
+"""turbopi.realtime.client: no answer is taken for another call's, no call waits for ever, only chunks get through."""
 
 import base64
 import hashlib
@@ -15,13 +15,13 @@ from serve_fakes import NO_CHUNKS
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
-from turbopi.client import RealTimeClient, ServerLost, ServerRefused
-from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.evaluate.sources import RemotePolicy
-from turbopi.running_chunk import RunningChunk
+from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import running
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 from turbopi.view.live import LiveServer
-from turbopi.wire import pack, unpack
 
 
 class Echo:
@@ -197,7 +197,7 @@ def ends(call: Callable[[], Any]) -> BaseException | None:
 def test_a_call_gives_up_at_its_deadline_though_the_server_reads_nothing(
     size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("turbopi.policy_socket.CLOSE_S", 3600.0)  # closing is within the deadline, too
+    monkeypatch.setattr("turbopi.realtime.policy_socket.CLOSE_S", 3600.0)  # closing is within the deadline, too
     with deaf_server() as port:
         client = RealTimeClient("127.0.0.1", port, answer_s=0.2)
         lost = ends(lambda: client.infer({"image": np.zeros(size, np.uint8)}))

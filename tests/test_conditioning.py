@@ -15,8 +15,8 @@ from torch import Tensor
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import open_checkpoint
 from turbopi.config import Kind
-from turbopi.errors import ObservationError
-from turbopi.model.conditioning import (
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import (
     Conditioning,
     Conditionings,
     Guidance,
@@ -27,12 +27,12 @@ from turbopi.model.conditioning import (
     guidance_weights,
     lerobot_guidance_weights,
 )
-from turbopi.model.denoise import time_grid
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.layers import AdaRMSNorm
-from turbopi.model.reference import Pi0Model, Trace
-from turbopi.observation import Observation
+from turbopi.models.pi0.denoise import time_grid
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.layers import AdaRMSNorm
+from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.support.errors import ObservationError
 
 CASES: dict[Kind, str] = {"pi05": "b_third_masked", "pi0": "p0_pi0_state"}
 KINDS: list[Kind] = ["pi05", "pi0"]
@@ -100,7 +100,7 @@ def test_a_tokens_time_changes_its_own_modulation_alone(kind: Kind) -> None:
     times[:, 4:7] = early
     steps = np.full((1, 10), np.float32(-0.25))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("turbopi.model.gemma.attention", lambda q, k, v, mask: q * 0)
+        patch.setattr("turbopi.models.pi0.gemma.attention", lambda q, k, v, mask: q * 0)
 
         def at(t: np.ndarray) -> Tensor:
             return model.denoise(cache, noise, 1, conditioning=Conditioning(TokenTimes(t, steps)))
@@ -195,7 +195,7 @@ def test_guidance_is_the_gradient_of_the_whole_function(kind: Kind) -> None:
 
 
 def velocity(model: Pi0Model, cache: KVCache, x: Tensor, t: float) -> Tensor:
-    from turbopi.model.denoise import suffix_mask, suffix_rope, time_embedding
+    from turbopi.models.pi0.denoise import suffix_mask, suffix_rope, time_embedding
 
     config = model.config
     emb = time_embedding(np.array([t], np.float32), config.expert.width)

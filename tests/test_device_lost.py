@@ -11,12 +11,13 @@ import torch
 from policy_helpers import policy_on
 
 from turbopi import UnifiedPolicy
-from turbopi.backends import Sample, lost
+from turbopi.backends import Sample
+from turbopi.backends import device_lost as lost
+from turbopi.backends.device_lost import STICKY, why_lost
 from turbopi.backends.fused import FusedBackend
-from turbopi.backends.lost import STICKY, why_lost
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import BackendError, BackendUnavailable, DeviceLost, ObservationError
+from turbopi.support.errors import BackendError, BackendUnavailable, DeviceLost, ObservationError
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 ILLEGAL = "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported"
@@ -219,7 +220,7 @@ def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None
 
 def test_it_holds_without_asserts() -> None:
     code = (
-        "import torch\nfrom turbopi.backends.lost import Guard\nfrom turbopi.errors import DeviceLost\n"
+        "import torch\nfrom turbopi.backends.device_lost import Guard\nfrom turbopi.support.errors import DeviceLost\n"
         "guard = Guard(torch.device('cpu'))\n"
         "for _ in range(2):\n"
         "    try:\n"

@@ -14,7 +14,7 @@ from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendUnavailable
+from turbopi.support.errors import BackendUnavailable
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
@@ -36,7 +36,7 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: gpu.capability)
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: object())
     monkeypatch.setattr("shutil.which", lambda name, *rest: f"/usr/bin/{name}")
-    monkeypatch.setattr("turbopi.toolchain._missing_headers", lambda: None)
+    monkeypatch.setattr("turbopi.support.toolchain._missing_headers", lambda: None)
     device = torch.device("cuda", 0)
     for precision in tables.TIERS:
         chosen = backends.choose(device, precision)[0]

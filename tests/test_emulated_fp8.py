@@ -15,13 +15,13 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, input_rounding, rounded
-from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.formats import FORMATS, FP8, INT8, Format, Numbers
 from turbopi.quantization.plan import TIERS, Tier, format_of
 from turbopi.quantization.sites import sites
+from turbopi.support.errors import ConfigError
 from turbopi.verify.check_golden import check_folder, golden_calibration
 from turbopi.verify.golden import GoldenFolder
 

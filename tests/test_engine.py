@@ -16,14 +16,14 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.compiled import compiled
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
-from turbopi.model.reference import FloatPrecision
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import FloatPrecision
 
 FIELDS = ("images", "image_mask", "tokens", "token_mask", "state")
 CPU = torch.device("cpu")

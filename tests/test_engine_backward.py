@@ -16,15 +16,15 @@ from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, su
 from turbopi.engine.compiled import compiled
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import expert_output, project, rope_of_all_positions
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.weights import pack
 from turbopi.kernels.backward import PLAIN as PIECES
 from turbopi.kernels.backward import PLAIN_BACKWARD, rope_vjp
 from turbopi.kernels.interface import BackwardOps, KeptStep, Ops
 from turbopi.kernels.plain import PLAIN
-from turbopi.model.denoise import suffix_mask, suffix_rope, time_embedding
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model
+from turbopi.models.pi0.denoise import suffix_mask, suffix_rope, time_embedding
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model
 
 CASES: dict[Kind, str] = {"pi05": "b_third_masked", "pi0": "p0_pi0_state"}
 KINDS: list[Kind] = ["pi05", "pi0"]

@@ -14,17 +14,17 @@ from torch import Tensor
 from turbopi.config import Kind
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
 from turbopi.engine.call import Pictures
+from turbopi.engine.graph_cache import MOST_LOOPS, Loop
 from turbopi.engine.packing import TILE, most_tiles, pack_rows, split
-from turbopi.engine.recent_loops import MOST_LOOPS, Loop
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
-from turbopi.errors import ObservationError
 from turbopi.kernels.interface import PairDenoiser
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise.plain import denoise_plain
-from turbopi.model.denoise import euler_step
-from turbopi.model.reference import Trace
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.denoise import euler_step
+from turbopi.models.pi0.reference import Trace
+from turbopi.support.errors import ObservationError
 
 CPU = torch.device("cpu")
 COSTS = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}

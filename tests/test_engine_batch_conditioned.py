@@ -14,12 +14,12 @@ from torch import Tensor
 from turbopi.config import Kind
 from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.conditioned import batch_form, batch_loop
-from turbopi.engine.recent_loops import Loop
-from turbopi.errors import ObservationError
-from turbopi.model.conditioning import Conditioning, TokenTimes
-from turbopi.model.reference import Trace
-from turbopi.model.solvers import Integration
-from turbopi.observation import Observation
+from turbopi.engine.graph_cache import Loop
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, TokenTimes
+from turbopi.models.pi0.reference import Trace
+from turbopi.models.pi0.solvers import Integration
+from turbopi.support.errors import ObservationError
 from turbopi.verify.golden import Case
 
 KINDS: list[Kind] = ["pi05", "pi0"]

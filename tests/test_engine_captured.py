@@ -12,8 +12,8 @@ from test_engine_batch import observations
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbopi.config import Kind
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.solvers import Integration
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.solvers import Integration
 
 STEPS, H, A = 2, 5, 32
 # A tensor's value in Python, a result whose size depends on values, a tensor of Python's numbers.

@@ -15,11 +15,11 @@ from torch import Tensor
 from turbopi.backends.abilities import Abilities
 from turbopi.config import Kind
 from turbopi.engine.conditioned import MOST_TIMES, conditioned_loop
-from turbopi.engine.recent_loops import MOST_LOOPS, Loop
-from turbopi.errors import ObservationError
-from turbopi.model.conditioning import Conditioning, TokenTimes
-from turbopi.model.solvers import Integration
-from turbopi.observation import Observation
+from turbopi.engine.graph_cache import MOST_LOOPS, Loop
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, TokenTimes
+from turbopi.models.pi0.solvers import Integration
+from turbopi.support.errors import ObservationError
 
 KINDS: list[Kind] = ["pi05", "pi0"]
 STEPS = 4

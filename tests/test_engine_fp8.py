@@ -18,17 +18,17 @@ from turbopi.engine import forward
 from turbopi.engine import weights as engine_weights
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.emulate import RoundedWeights, rounded
-from turbopi.engine.recent_loops import Loop, RecentLoops
+from turbopi.engine.graph_cache import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation, pack
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
 from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
 from turbopi.quantization.formats import FORMATS, FP8, Format
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix
 from turbopi.quantization.sites import Site, sites
+from turbopi.support.errors import BackendUnavailable
 from turbopi.verify.check_golden import golden_calibration
 
 CPU, META = torch.device("cpu"), torch.device("meta")

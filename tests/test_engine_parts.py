@@ -24,12 +24,12 @@ from turbopi.engine.call import Part, Pictures
 from turbopi.engine.forward import MOST_ROWS, row_chunks
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendError
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.preprocess.images import fitted
 from turbopi.quantization.fp8 import Matrix
+from turbopi.support.errors import BackendError
 
 CAMERAS = [2, 0, 3, 1]
 

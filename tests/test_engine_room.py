@@ -10,9 +10,9 @@ from torch import Tensor
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import PRESETS
-from turbopi.engine.room import GATE_UP, PackingRoom, is_conditioning, join, joined_with
+from turbopi.engine.weight_placement import GATE_UP, PackingRoom, is_conditioning, join, joined_with
 from turbopi.engine.weights import Weights, pack
-from turbopi.model.reference import parameter_shapes
+from turbopi.models.pi0.reference import parameter_shapes
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 CONFIG = PRESETS["pi05_tiny"].with_model(vocab_size=64)

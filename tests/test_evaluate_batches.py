@@ -16,10 +16,10 @@ from test_running_chunk import trained_policy
 
 from turbopi import UnifiedPolicy
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import ActionError
 from turbopi.evaluate.results import Results
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.running_chunk import JoinMode, RunningChunk
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.support.errors import ActionError
 
 H = 10
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none --max-steps 3"

@@ -12,11 +12,11 @@ from typer.testing import CliRunner, Result
 from turbopi import serve
 from turbopi.cli import app
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.installation import install_command
 from turbopi.recordings import load_call, recorded_files
 from turbopi.sim import libero
+from turbopi.support.errors import ConfigError
+from turbopi.support.installation import install_command
 
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none"
 

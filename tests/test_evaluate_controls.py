@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.controls import Controlled
 from turbopi.evaluate.sources import Answer
+from turbopi.support.errors import ConfigError
 
 KEYS = ("observation/image", "observation/wrist_image")
 TASKS = ["take the red one", "take the green one", "take the blue one"]

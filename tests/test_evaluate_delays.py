@@ -11,7 +11,6 @@ import pytest
 from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_delay
 from turbopi.evaluate.delays import Cell, document, make_cells, write_delays
 from turbopi.evaluate.episode import Execution, run_episode
@@ -19,10 +18,11 @@ from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import protocol_json
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.execution import WAYS
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.realtime import WAYS
 from turbopi.sim import create
 from turbopi.sim.base import Task
+from turbopi.support.errors import ConfigError
 
 TASK = Task(0, "count", "count", 10, 30)
 
@@ -227,7 +227,7 @@ def test_what_the_policy_cannot_do_is_refused_before_its_weights_are_loaded(
 
 
 def test_the_command_runs_every_cell_and_compares_them(tmp_path: Path) -> None:
-    from turbopi.shipped import CHASE_POLICY
+    from turbopi.policy.shipped import CHASE_POLICY
 
     result = turbopi(
         "eval", "chase", CHASE_POLICY, "--trials", 1, "--max-steps", 8, "--videos", "none", "--camera-px", 48,

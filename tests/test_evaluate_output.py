@@ -12,7 +12,6 @@ from evaluate_fakes import SeekingPolicy, run
 from file_helpers import no_room
 from msgspec.structs import replace
 
-from turbopi.errors import ConfigError, OutputError
 from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
 from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.plan import VideoPlan, parse_numbers
@@ -21,6 +20,7 @@ from turbopi.evaluate.report import write_report
 from turbopi.evaluate.sources import Answer, LocalPolicy
 from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
 from turbopi.evaluate.visited import Visited, action_error
+from turbopi.support.errors import ConfigError, OutputError
 
 GROUPS = chunk_groups("libero", 7)
 

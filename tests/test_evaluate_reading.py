@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.compare import cells, compare, document
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.report import write_report
 from turbopi.evaluate.results import Episode, PolicyTold, Results
-from turbopi.reading import plain_document
 from turbopi.sim import Task
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document
 
 
 def good(folder: Path) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import pytest
 from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_delay
 from turbopi.evaluate.delays import Cell, document, heads, make_cells, row, write_delays
 from turbopi.evaluate.episode import Ending, Execution, NoActions
@@ -22,9 +21,10 @@ from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.real_time import _STEP, RealTimeLoop, Unfit, _Policy
 from turbopi.evaluate.results import protocol_json
-from turbopi.execution import WAYS
+from turbopi.realtime import WAYS
 from turbopi.sim import create
 from turbopi.sim.base import Task
+from turbopi.support.errors import ConfigError
 
 HZ, STEP = 20.0, 1 / 20
 TASK = Task(0, "count", "count", 10, 60)
@@ -494,7 +494,7 @@ def test_compare_refuses_what_it_would_not_do() -> None:
 
 
 def test_the_command_runs_in_real_time(tmp_path: Path) -> None:
-    from turbopi.shipped import CHASE_POLICY
+    from turbopi.policy.shipped import CHASE_POLICY
 
     result = turbopi(
         "eval", "chase", CHASE_POLICY, "--trials", 1, "--max-steps", 8, "--videos", "none", "--camera-px", 48,

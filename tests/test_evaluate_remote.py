@@ -11,12 +11,12 @@ from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
 from turbopi import UnifiedPolicy, serve
-from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_way
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyRefused, RemotePolicy
-from turbopi.running_chunk import JoinMode
-from turbopi.shipped import CHASE_POLICY
+from turbopi.policy.shipped import CHASE_POLICY
+from turbopi.realtime.running_chunk import JoinMode
+from turbopi.support.errors import ConfigError
 
 RTC = ("rtc", "rtc_identity", "rtc_trained")
 STATES = (0, 1)

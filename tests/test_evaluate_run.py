@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, gathering, jobs_for, run
 
-from turbopi.errors import ActionError, ConfigError, OutputError, TurboPiError
 from turbopi.evaluate.plan import VideoPlan, make_jobs, noise_seed
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
 from turbopi.evaluate.schedule import TooManyCrashes
 from turbopi.evaluate.sources import PolicyRefused
-from turbopi.files import alone_in
 from turbopi.sim import SimulatorUnavailable
 from turbopi.sim.base import Task
+from turbopi.support.errors import ActionError, ConfigError, OutputError, TurboPiError
+from turbopi.support.files import alone_in
 
 TROUBLED = "evaluate_fakes:TroubledSimulator"
 

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 
 from turbopi import serve
-from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.evaluate.checks import check_fit
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy
+from turbopi.realtime.wire import MAX_BYTES, pack
 from turbopi.sim import SimSettings, create
-from turbopi.wire import MAX_BYTES, pack
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
 SETTINGS = SimSettings(camera_px=64)
 

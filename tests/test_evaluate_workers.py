@@ -11,7 +11,6 @@ import pytest
 from cli_helpers import refusal, turbopi
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, gathering, jobs_for, run
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_fit
 from turbopi.evaluate.plan import Protocol, choose_tasks
 from turbopi.evaluate.results import Episode, Results
@@ -20,6 +19,7 @@ from turbopi.evaluate.sources import LocalPolicy
 from turbopi.sim import SimSettings, create
 from turbopi.sim.base import observation_problem
 from turbopi.sim.reacher import ReacherSimulator
+from turbopi.support.errors import ConfigError
 
 
 @pytest.fixture(autouse=True)

@@ -9,9 +9,9 @@ import torch
 from conftest import golden_cases, golden_model
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from turbopi.model import exact
-from turbopi.model.exact import autocast, exact_float32, products
-from turbopi.model.reference import Pi0Model
+from turbopi.models.pi0 import exact
+from turbopi.models.pi0.exact import autocast, exact_float32, products
+from turbopi.models.pi0.reference import Pi0Model
 
 NEWER = hasattr(torch._C, "_get_fp32_precision_getter")
 newer = pytest.mark.skipif(not NEWER, reason="switches of PyTorch 2.9")

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from turbopi.errors import ConfigError
-from turbopi.execution import WAYS, ChunkQueue, DelayEstimate, Request, way_named
-from turbopi.running_chunk import RunningChunk
+from turbopi.realtime import WAYS, ChunkQueue, DelayEstimate, Request, way_named
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.support.errors import ConfigError
 
 RTC = [name for name, way in WAYS.items() if way.mode is not None]
 ASYNC = [name for name, way in WAYS.items() if not way.stands_still]

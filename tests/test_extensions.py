@@ -11,10 +11,11 @@ import torch
 from cli_helpers import refusal, text_of, turbopi
 from distributions import install
 
-from turbopi import UnifiedPolicy, backends, extensions
+from turbopi import UnifiedPolicy, backends
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.shipped import SMALL_POLICY
+from turbopi.policy.shipped import SMALL_POLICY
+from turbopi.support import extensions
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 CPU = torch.device("cpu")
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")

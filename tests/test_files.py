@@ -18,8 +18,8 @@ import pytest
 from file_helpers import no_room
 from matplotlib.figure import Figure
 
-from turbopi.errors import CheckpointError, ConfigError, OutputError
-from turbopi.files import (
+from turbopi.support.errors import CheckpointError, ConfigError, OutputError
+from turbopi.support.files import (
     alone_in,
     append_line,
     cache_folder,
@@ -29,7 +29,7 @@ from turbopi.files import (
     whole_lines,
     write_whole,
 )
-from turbopi.plots import write_figure
+from turbopi.support.plots import write_figure
 
 
 def names(folder: Path) -> list[str]:

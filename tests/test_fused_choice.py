@@ -12,14 +12,14 @@ from torch import Tensor
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent_loops import Loop
-from turbopi.errors import BackendUnavailable, DeviceLost
+from turbopi.engine.graph_cache import Loop
 from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing as denoise_packing
 from turbopi.kernels.sm90.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.plain import denoise_plain
+from turbopi.support.errors import BackendUnavailable, DeviceLost
 
 GPU = torch.device("cuda", 0)
 MATRICES = ("qkv", "out", "gate_up", "down")

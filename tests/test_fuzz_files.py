@@ -25,23 +25,23 @@ from lerobot_golden import GOLDEN as LEROBOT_GOLDEN
 from lerobot_golden import GoldenCase
 from PIL import Image
 
+from turbopi.backends.onnx.export import GRAPHS, MANIFEST, open_export
+from turbopi.backends.tensorrt.calibrate import Calibration
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.cli.files import load_noise
 from turbopi.config import LIMITS, preset
-from turbopi.errors import TurboPiError
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Episode, PolicyTold, Results
 from turbopi.evaluate.visited import Visited
-from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
 from turbopi.quantization.sites import sites
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import RecordedCall, load_call, load_observation, save_call
 from turbopi.robots.described import load_robot
 from turbopi.sim import Task
-from turbopi.tensorrt.calibrate import Calibration
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import TurboPiError
 
 FACTOR = float(os.environ.get("TURBOPI_FUZZ", "1"))
 MAX_GROWTH = 700 * 2**20  # of memory, by a target with all of its damages

@@ -19,9 +19,9 @@ from turbopi.engine import forward
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
 from turbopi.engine.runner import HostRow
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.reference import FloatPrecision
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.preprocess.images import RESIZES, fitted
 from turbopi.verify.check_golden import check_case
 

@@ -126,7 +126,7 @@ def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> N
     [
         *("kernels/portable/norms.py", "kernels/sm90/instructions.cu", "kernels/sm90/denoise/kernel.py"),
         *("kernels/sm90/denoise/few/loop.cu", "kernels/sm90/gemm/fp8.py", "kernels/sm90/gemm/kernel.cu"),
-        *("backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "model/reference.py"),
+        *("backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "models/pi0/reference.py"),
     ],
 )
 def test_what_runs_on_the_gpu_is_in_the_fingerprint(file: str) -> None:
@@ -141,7 +141,7 @@ def test_a_backend_that_is_not_in_the_fingerprint_refuses_every_gpu() -> None:
         assert f"src/turbopi/backends/{name}.py" not in gpu_evidence.fingerprint()
         assert "use device 'cpu'" in str(registry.availability(name, torch.device("cuda")))
     recorded = gpu_evidence.fingerprint()
-    assert gpu_evidence.changed_since(recorded | {"src/turbopi/backends/onnx.py": "other"}) == []
+    assert gpu_evidence.changed_since(recorded | {"src/turbopi/backends/onnx/backend.py": "other"}) == []
     assert gpu_evidence.changed_since(recorded | {"src/turbopi/backends/fused.py": "other"}) != []
 
 

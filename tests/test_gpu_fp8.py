@@ -16,9 +16,9 @@ from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.reference import Pi0Model
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration

@@ -13,8 +13,8 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.kernels.portable.denoise.packing import refusal
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import Pi0Model
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.formats import INT8
 from turbopi.quantization.sites import sites

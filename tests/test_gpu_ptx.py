@@ -11,11 +11,11 @@ import torch
 from kernel_turns.problems import CONFIGS, GPU, has_nvrtc
 from kernel_turns.ptx import CASES, TRITON, Case, RanAsPtx, capability_of, compared, judged, read_ptx, triton_rows
 
-from turbopi.errors import ConfigError
 from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels import nvrtc
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
+from turbopi.support.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 NUMBERS: dict[str, list[WeightNumbers]] = {"compute_80": ["bf16", "int8"], "compute_89": ["fp8"]}

@@ -9,9 +9,9 @@ from test_engine import made_up
 from test_gpu import GRAPHS, PORTABLE, backend, rms
 
 from turbopi.config import Kind
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.reference import FloatPrecision
-from turbopi.model.solvers import SOLVERS, Integration
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.reference import FloatPrecision
+from turbopi.models.pi0.solvers import SOLVERS, Integration
 
 pytestmark = [
     pytest.mark.gpu,

@@ -18,9 +18,9 @@ from conftest import on_hopper
 
 from turbopi import UnifiedPolicy, backends
 from turbopi.checkpoint import random_checkpoint
-from turbopi.engine.recent_loops import MOST_LOOPS
-from turbopi.errors import ObservationError
-from turbopi.model import exact
+from turbopi.engine.graph_cache import MOST_LOOPS
+from turbopi.models.pi0 import exact
+from turbopi.support.errors import ObservationError
 
 pytestmark = [
     pytest.mark.gpu,
@@ -223,7 +223,7 @@ ASSERTS_ON_THE_DEVICE = """
 import torch
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import DeviceLost
+from turbopi.support.errors import DeviceLost
 
 policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend=%r, device="cuda:0", num_denoising_steps=1)
 observation = policy.example_observation()

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from turbopi import installation
-from turbopi.installation import install_command
+from turbopi.support import installation
+from turbopi.support.installation import install_command
 
 ROOT = Path(__file__).parents[1]
 

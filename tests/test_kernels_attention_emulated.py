@@ -18,7 +18,6 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 import machine_code
 
 from turbopi.engine.packing import pack_rows
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels import nvrtc, plain, plain_batch
 from turbopi.kernels.interface import Segments
 from turbopi.kernels.sm90.attention import kernel as attention
@@ -26,6 +25,7 @@ from turbopi.kernels.sm90.attention import suffix
 from turbopi.kernels.sm90.attention.kernel import AttentionTile
 from turbopi.kernels.sm90.attention.suffix_tile import FewTile, SuffixTile
 from turbopi.quantization.fp8 import E4M3
+from turbopi.support.errors import BackendUnavailable
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
 SEEDS = (0, 1, 5)  # of the order in which threads go; with 1 and 5 products read at once, with 5 a CTA stands still

@@ -12,7 +12,7 @@ from torch import Tensor
 from turbopi.kernels import backward as twins
 from turbopi.kernels import plain
 from turbopi.kernels.portable import backward
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.layers import rope_tables
 
 pytestmark = gpu_or_interpreter()
 SIZES = [(1, 8), (10, 1024), (7, 96)]

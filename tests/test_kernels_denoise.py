@@ -22,15 +22,15 @@ from kernel_turns.problems import (
 from kernel_turns.stalls import disassembled
 from torch import Tensor
 
-from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import nvrtc
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing
 from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
-from turbopi.model.denoise import euler_step
+from turbopi.models.pi0.denoise import euler_step
 from turbopi.quantization.directions import directions
+from turbopi.support.errors import BackendError, BackendUnavailable
 
 CPU = torch.device("cpu")
 

@@ -23,7 +23,7 @@ from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import KINDS, RANKS, Arrangement, PackedExpert
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.layers import rope_tables
 
 CPU = torch.device("cpu")
 ENTRY = emulate.MACHINE.with_name("denoise_kept.cu")

@@ -19,12 +19,12 @@ from kernel_turns.problems import (
 )
 from torch import Tensor
 
-from turbopi.errors import BackendError
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing
 from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
-from turbopi.model.denoise import euler_step
+from turbopi.models.pi0.denoise import euler_step
+from turbopi.support.errors import BackendError
 
 BEFORE = 3  # rows of the cache that are another observation's
 SHAPES = pytest.mark.parametrize(

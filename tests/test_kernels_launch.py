@@ -18,11 +18,11 @@ import pytest
 import torch
 
 from turbopi.engine.graph import Graph, Mark
-from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels import nvrtc
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.sm90 import instructions
+from turbopi.support.errors import BackendError, BackendUnavailable
 
 
 class Status(enum.IntEnum):

@@ -21,7 +21,7 @@ from turbopi.kernels.portable.ops import EmbedPatches  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import products, tiles  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
-from turbopi.model.layers import rope_tables  # noqa: E402
+from turbopi.models.pi0.layers import rope_tables  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32

@@ -20,14 +20,14 @@ from kernel_turns.problems import (
     standing_for,
 )
 
-from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise import packing
 from turbopi.kernels.portable.denoise.packing import PackedExpert, WeightNumbers
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
-from turbopi.model.denoise import euler_step
+from turbopi.models.pi0.denoise import euler_step
 from turbopi.quantization.formats import FORMATS, INT8, Format
+from turbopi.support.errors import BackendError, BackendUnavailable
 
 CPU = torch.device("cpu")
 SMALL = pytest.mark.parametrize("name", ["golden", "tiny", "odd", "uneven"])

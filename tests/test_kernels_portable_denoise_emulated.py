@@ -27,7 +27,7 @@ from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
-from turbopi.model.denoise import euler_step
+from turbopi.models.pi0.denoise import euler_step
 from turbopi.quantization.formats import INT8
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")

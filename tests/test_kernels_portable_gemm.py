@@ -16,7 +16,6 @@ from torch import Tensor
 ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.errors import ConfigError  # noqa: E402
 from turbopi.kernels import ops as kernels_ops  # noqa: E402
 from turbopi.kernels import plain  # noqa: E402
 from turbopi.kernels.portable import activations, attention, norms  # noqa: E402
@@ -28,6 +27,7 @@ from turbopi.kernels.portable.quantize import quantize  # noqa: E402
 from turbopi.kernels.tile_table import LIBRARY, TileKey, TileTable  # noqa: E402
 from turbopi.quantization.formats import FP8, INT8, Format  # noqa: E402
 from turbopi.quantization.fp8 import E4M3_MAX, ScaledMatrix, to_e4m3  # noqa: E402
+from turbopi.support.errors import ConfigError  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32

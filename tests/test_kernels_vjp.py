@@ -13,7 +13,7 @@ from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.portable.vjp import attention
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, way_back
 from turbopi.kernels.portable.vjp.tiles import LEAST_ROWS, attention_span, row_block, streaming
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.layers import rope_tables
 
 pytestmark = gpu_or_interpreter()
 FULL, SMALL, NARROW = GemmaConfig(1024, 4096), GemmaConfig(64, 160, 1, 3, 1, 32), GemmaConfig(32, 64, 1, 8, 1, 16)

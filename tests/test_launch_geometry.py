@@ -17,7 +17,6 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.attention import suffix, suffix_tile
@@ -29,6 +28,7 @@ from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
 from turbopi.kernels.sm90.gemm import tiles
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix
+from turbopi.support.errors import BackendUnavailable
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")

@@ -17,9 +17,9 @@ from lerobot_golden import GOLDEN
 
 from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.settings import Settings
-from turbopi.errors import TurboPiError
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, PromptTokenizer, load_tokenizer
+from turbopi.support.errors import TurboPiError
 
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()

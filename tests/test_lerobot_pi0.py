@@ -10,8 +10,8 @@ from lerobot_golden import GOLDEN, GoldenCase
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import convert, inspect_checkpoint, open_checkpoint
 from turbopi.config import Normalization
-from turbopi.errors import CheckpointError, ConfigError
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.support.errors import CheckpointError, ConfigError
 
 PRE = "policy_preprocessor.json"
 NEW_LINE, TOKENIZER, RENAME = "pi0_new_line_processor", "tokenizer_processor", "rename_observations_processor"

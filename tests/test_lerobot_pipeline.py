@@ -14,7 +14,7 @@ from checkpoint_helpers import edit_json, lerobot_copy
 from turbopi.checkpoint import open_checkpoint
 from turbopi.checkpoint.lerobot_pipeline import Pipelines
 from turbopi.config import VisionConfig
-from turbopi.errors import CheckpointError
+from turbopi.support.errors import CheckpointError
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 RENAME, BATCH, RELATIVE = "rename_observations_processor", "to_batch_processor", "relative_actions_processor"

@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot_golden import GOLDEN, GoldenCase
 
-from turbopi.errors import ActionError, CheckpointError, ConfigError, ObservationError
+from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 H, D = 10, 32

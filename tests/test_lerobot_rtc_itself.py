@@ -16,8 +16,8 @@ from test_conditioning import SCHEDULES
 from test_lerobot_itself import PYTHON
 from torch import Tensor
 
-from turbopi.model.conditioning import GuidanceMode, guidance_strength, lerobot_guidance_weights
-from turbopi.model.denoise import Pull, guided_velocity
+from turbopi.models.pi0.conditioning import GuidanceMode, guidance_strength, lerobot_guidance_weights
+from turbopi.models.pi0.denoise import Pull, guided_velocity
 
 H, A = 10, 7
 MOST = 10.0

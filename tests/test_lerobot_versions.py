@@ -11,9 +11,9 @@ from safetensors.torch import load_file
 from turbopi.checkpoint import convert, open_checkpoint
 from turbopi.checkpoint.lerobot_versions import FIRST_KEYS, detect
 from turbopi.config import PolicyConfig, VisionConfig
-from turbopi.errors import ConfigError
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.support.errors import ConfigError
 
 HEAD, EMBEDDING = (
     f"model.paligemma_with_expert.paligemma.{name}.weight" for name in ("lm_head", "model.language_model.embed_tokens")

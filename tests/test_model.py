@@ -11,11 +11,11 @@ from conftest import golden_cases, golden_model
 from torch import Tensor
 
 from turbopi.config import GemmaConfig, Kind, ModelConfig
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.model.denoise import time_embedding, time_grid
-from turbopi.model.layers import attention
-from turbopi.model.reference import FloatPrecision, Pi0Model, parameter_dtype, parameter_shapes
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.denoise import time_embedding, time_grid
+from turbopi.models.pi0.layers import attention
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.support.errors import ConfigError, ObservationError
 
 STEPS = 3
 

@@ -12,9 +12,9 @@ from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor
 
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.errors import CheckpointError
-from turbopi.model import denoise, reference
-from turbopi.model.reference import FloatPrecision, Pi0Model
+from turbopi.models.pi0 import denoise, reference
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
+from turbopi.support.errors import CheckpointError
 from turbopi.verify.check_golden import Comparison, check_case
 from turbopi.verify.golden import GoldenFolder
 

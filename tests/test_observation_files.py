@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from turbopi.cli.files import load_noise
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.visited import FILE, Visited
-from turbopi.reading.pictures import read_picture
 from turbopi.recordings import RecordedCall, iter_recording, load_call, load_observation, save_call
+from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.reading.images import read_picture
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 

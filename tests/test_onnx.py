@@ -20,19 +20,19 @@ from torch import Tensor
 from typer.testing import Result
 
 from turbopi import backends
-from turbopi.backends.onnx import OnnxBackend, Sessions
+from turbopi.backends.onnx import cache as kept
+from turbopi.backends.onnx import export as exporting
+from turbopi.backends.onnx.backend import OnnxBackend, Sessions
+from turbopi.backends.onnx.export import MANIFEST, Export, export_onnx, open_export
+from turbopi.backends.onnx.graphs import graphs
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli.compare import parse_variant
 from turbopi.cli.evaluate import EvalOptions
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import Kind
-from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, OutputError
-from turbopi.export import kept
-from turbopi.export import onnx as exporting
-from turbopi.export.graphs import graphs
-from turbopi.export.onnx import MANIFEST, Export, export_onnx, open_export
-from turbopi.installation import install_command
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, OutputError
+from turbopi.support.installation import install_command
 from turbopi.verify.check_golden import check_case
 
 for library in ("onnx", "onnxscript", "onnxruntime"):
@@ -103,9 +103,9 @@ def fresh_inputs(kind: Kind, graph: str, length: int, horizon: int) -> dict[str,
 
 def reference(kind: Kind, graph: str, inputs: dict[str, Tensor]) -> list[Tensor]:
     """What the reference's own functions make of a graph's inputs."""
-    from turbopi.model.denoise import suffix_mask, suffix_rope
-    from turbopi.model.kv_cache import KVCache
-    from turbopi.model.prefix import embed_prompt
+    from turbopi.models.pi0.denoise import suffix_mask, suffix_rope
+    from turbopi.models.pi0.kv_cache import KVCache
+    from turbopi.models.pi0.prefix import embed_prompt
 
     model = golden_model(kind)
     if graph == "vision":

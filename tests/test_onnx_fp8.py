@@ -10,15 +10,15 @@ from cli_helpers import refusal, turbopi
 from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor, nn
 
-from turbopi.backends.onnx import OnnxBackend
+from turbopi.backends.onnx.backend import OnnxBackend
+from turbopi.backends.onnx.export import export_onnx, open_export
+from turbopi.backends.tensorrt.calibrate import Calibration, calibrate
+from turbopi.backends.tensorrt.networks import Fp8Scales
+from turbopi.backends.tensorrt.ops import to_fp8
 from turbopi.checkpoint.onnx_folder import GraphSource
-from turbopi.errors import ConfigError
-from turbopi.export.onnx import export_onnx, open_export
-from turbopi.model.layers import GeGLU
-from turbopi.model.reference import Pi0Model
-from turbopi.tensorrt.calibrate import Calibration, calibrate
-from turbopi.tensorrt.networks import Fp8Scales
-from turbopi.tensorrt.ops import to_fp8
+from turbopi.models.pi0.layers import GeGLU
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.support.errors import ConfigError
 
 needs_rtx = pytest.mark.skipif(importlib.util.find_spec("tensorrt_rtx") is None, reason="TensorRT-RTX isn't installed")
 
@@ -121,9 +121,9 @@ def test_scales_of_another_model_are_refused(calibration: Calibration, tmp_path:
 @needs_rtx
 def test_the_files_build_engines(folder: Path) -> None:
     """The prefix, with FP8 in it, needs a GPU or TensorRT-RTX 1.7: 1.4 asks the GPU for something."""
-    from turbopi.export.shapes import shapes_of
-    from turbopi.tensorrt import library
-    from turbopi.tensorrt.engine import build_onnx
+    from turbopi.backends.onnx.shapes import shapes_of
+    from turbopi.backends.tensorrt import library
+    from turbopi.backends.tensorrt.engine import build_onnx
 
     export, version = open_export(folder), library().version
     with_fp8 = ("prefix",) if tuple(map(int, version.split(".")[:2])) >= (1, 7) else ()

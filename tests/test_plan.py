@@ -23,10 +23,10 @@ from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
-from turbopi.errors import ConfigError
+from turbopi.serve.fleet.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, batch_times, plan_fleet, worst_seconds
 from turbopi.serve.options import ServerOptions
-from turbopi.serve.schedule import Schedule
-from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, batch_times, plan_fleet, worst_seconds
+from turbopi.serve.scheduling.schedule import Schedule
+from turbopi.support.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 CERTIFICATE = ROOT / "benchmarks" / "results" / "h100_2026-11-26_int8" / "verify.json"

@@ -11,8 +11,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from turbopi.evaluate.plots import write_plots
-from turbopi.plots import SOLVED, Row, plot_chunks
-from turbopi.showing import action_groups
+from turbopi.support.action_groups import action_groups
+from turbopi.support.plots import SOLVED, Row, plot_chunks
 
 RANDOM = np.random.default_rng(0)
 

@@ -13,8 +13,8 @@ from conftest import GOLDEN, golden_folder
 
 from turbopi.checkpoint import Checkpoint, load_norm_stats, open_checkpoint, random_checkpoint
 from turbopi.config import Kind, Normalization, NormMode, PolicyConfig, preset
-from turbopi.errors import BackendUnavailable, ConfigError, ObservationError, TokenizerError
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.errors import BackendUnavailable, ConfigError, ObservationError, TokenizerError
 
 H = 10
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from turbopi import UnifiedPolicy
 from turbopi.backends import Sample
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import ActionError
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.support.errors import ActionError
 
 H, D = 10, 32
 STAGES = {"vision": 1.0, "prefix": 2.0, "denoise": 3.0}

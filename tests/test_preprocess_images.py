@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbopi.errors import ObservationError
 from turbopi.preprocess import images
 from turbopi.preprocess.images import RESIZES, all_fitted, fitted, resize_into, resize_unit_into, resize_with_pad
-from turbopi.robots.pictures import parse_chw_image, parse_image, parse_unit_image, to_uint8
+from turbopi.robots.images import parse_chw_image, parse_image, parse_unit_image, to_uint8
+from turbopi.support.errors import ObservationError
 
 GOLDEN = np.load(Path(__file__).parent / "golden" / "preprocess" / "resize.npz")
 RESIZED = [name for name in GOLDEN.files if re.search(r"/out_\d+x\d+$", name)]

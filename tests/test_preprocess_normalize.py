@@ -14,10 +14,10 @@ from hypothesis.extra.numpy import arrays
 
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_stats
 from turbopi.config import NormMode
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.preprocess.normalize import Normalizer, pad_last
 from turbopi.preprocess.relative_actions import absolute_actions, delta_actions
 from turbopi.robots.base import action_mask
+from turbopi.support.errors import ConfigError, ObservationError
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 NORMALIZED = packed_arrays(FOLDER / "normalize.npz")

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_stats
 from turbopi.config import CAMERAS, PRESETS, ModelConfig, Normalization, NormMode, PolicyConfig, preset
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
 from turbopi.preprocess.images import resize_unit_into
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import PromptTokenizer, prompt_texts
 from turbopi.robots import Robot, RobotInputs, create_robot
 from turbopi.robots.libero import Libero
+from turbopi.support.errors import ConfigError, ObservationError
 
 GOLDEN = Path(__file__).parent / "golden"
 POLICIES: dict[str, dict[str, Any]] = json.loads((GOLDEN / "policy" / "policy.json").read_text())

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from turbopi import provenance as module
-from turbopi.provenance import driver_version, provenance
+from turbopi.support import provenance as module
+from turbopi.support.provenance import driver_version, provenance
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git isn't installed")
 
@@ -45,7 +45,7 @@ def test_the_version_is_always_recorded() -> None:
 def test_a_checkout_of_ours_is_told_by_its_commit_and_by_its_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = "src/turbopi/provenance.py"
+    name = "src/turbopi/support/provenance.py"
     commit = repository(tmp_path, name)
     assert told(monkeypatch, tmp_path / name) == commit
     (tmp_path / "README").write_text("changed")
@@ -69,7 +69,7 @@ def test_a_repository_around_the_installation_isnt_taken_for_ours(
 
 def test_a_repository_that_the_environment_names_is_no_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As within a git hook."""
-    name = "src/turbopi/provenance.py"
+    name = "src/turbopi/support/provenance.py"
     commit = repository(tmp_path / "ours", name)
     repository(tmp_path / "theirs", name)
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "theirs" / ".git"))

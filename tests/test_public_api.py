@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import turbopi
-from turbopi import errors
+from turbopi.support import errors
 
 
 @pytest.mark.parametrize("name", turbopi.__all__)
@@ -23,7 +23,7 @@ def test_every_public_name_can_be_imported(name: str) -> None:
 def test_public_names_are_the_objects_that_their_modules_define() -> None:
     for name, module in (("UnifiedPolicy", "policy"), ("Robot", "robots"), ("open_checkpoint", "checkpoint")):
         assert getattr(turbopi, name) is getattr(importlib.import_module(f"turbopi.{module}"), name)
-    assert turbopi.errors is errors
+    assert turbopi.support.errors is errors
 
 
 def test_every_error_is_public() -> None:
@@ -46,9 +46,9 @@ def test_import_turbopi_imports_neither_torch_nor_numpy() -> None:
 
 def test_without_pytorch_a_policy_is_refused_in_words() -> None:
     """A robot's computer has Turbo-Pi's client alone."""
-    code = "import sys; sys.modules['torch'] = None\nimport turbopi.client\nfrom turbopi import UnifiedPolicy"
+    code = "import sys; sys.modules['torch'] = None\nimport turbopi.realtime.client\nfrom turbopi import UnifiedPolicy"
     here = {**os.environ, "PYTHONPATH": str(Path(turbopi.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
     last = done.stderr.splitlines()[-1]
     assert last.startswith("ImportError: turbopi.UnifiedPolicy needs PyTorch, which isn't installed: "), done.stderr
-    assert last.endswith("turbopi.client alone, without PyTorch (docs/real_time.md)")
+    assert last.endswith("turbopi.realtime.client alone, without PyTorch (docs/real_time.md)")

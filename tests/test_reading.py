@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from turbopi.errors import CheckpointError, ConfigError, ObservationError, TurboPiError
-from turbopi.reading import Fields, Npz, file_inside, read_json, read_npy, read_npz
+from turbopi.support.errors import CheckpointError, ConfigError, ObservationError, TurboPiError
+from turbopi.support.reading import Fields, Npz, file_inside, read_json, read_npy, read_npz
 
 
 def _refused(call: Any, error: type[TurboPiError] = CheckpointError) -> str:

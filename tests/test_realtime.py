@@ -13,9 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from realtime_fakes import HZ, Clock, LinePolicy, Loop, started
 
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.execution import WAYS
-from turbopi.realtime import OutOfActions, RealTimeExecutor
+from turbopi.realtime import WAYS, OutOfActions, RealTimeExecutor
+from turbopi.support.errors import ConfigError, ObservationError
 
 RTC = [name for name, way in WAYS.items() if way.mode is not None]
 
@@ -703,7 +702,7 @@ class Refuse:
 BLOCKED = {"torch", "msgspec", "msgpack", "websockets", "matplotlib", "safetensors", "PIL", "typer", "rich",
            "sentencepiece", "tensorstore", "jinja2", "psutil", "packaging", "prometheus_client"}
 sys.meta_path.insert(0, Refuse())
-import turbopi.realtime, turbopi.execution
+import turbopi.realtime, turbopi.realtime
 policy = type("Policy", (), {"infer": lambda self, obs: {}})()
 turbopi.realtime.RealTimeExecutor(policy, control_hz=50, execution="async").close()
 print(sorted(BLOCKED & set(sys.modules)))

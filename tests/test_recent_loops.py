@@ -15,16 +15,16 @@ from test_engine_batch import observations
 from torch import Tensor
 
 from turbopi.backends.fused import FusedBackend
-from turbopi.backends.tensorrt import TensorRTBackend
-from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
+from turbopi.backends.tensorrt.backend import TensorRTBackend
+from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
 from turbopi.engine.batch import SharedRows
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, RecentLoops, fit
+from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, Loop, RecentLoops, fit
 from turbopi.engine.runner import HostRow
 from turbopi.engine.solving import evaluation_loops
 from turbopi.engine.without_compiler import OPS
-from turbopi.errors import BackendUnavailable, ObservationError
-from turbopi.model.solvers import Integration
+from turbopi.models.pi0.solvers import Integration
+from turbopi.support.errors import BackendUnavailable, ObservationError
 
 STEPS = range(1, 41)
 

@@ -13,11 +13,11 @@ from test_begin import OnCpu
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
 from turbopi.engine.resize import MOST_SIZES, Resizer, taps_of
-from turbopi.errors import ObservationError
 from turbopi.kernels import plain
 from turbopi.kernels.interface import SOURCE, Ops
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.images import RESIZES, fitted, placement
+from turbopi.support.errors import ObservationError
 
 SIDE = 224  # PyTorch sums in another order where a result's height and width are 128 together, or less
 # (height, width): cameras' own, larger and smaller, odd, square, narrow, one axis kept, already of the size

@@ -18,9 +18,9 @@ from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import fingerprint
 from turbopi.bench.report import report
 from turbopi.calibrate.report import read_report
-from turbopi.errors import CalibrationError, ConfigError
-from turbopi.provenance import Provenance
-from turbopi.reading import as_document, plain_document, read_document
+from turbopi.support.errors import CalibrationError, ConfigError
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import as_document, plain_document, read_document
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 

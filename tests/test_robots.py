@@ -11,9 +11,9 @@ import pytest
 from conftest import packed_arrays
 
 from turbopi.config import CAMERAS, PRESETS
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.robots import ROBOTS, Robot, create_robot, import_robot, load_robot, robot_from_dict
 from turbopi.robots.base import find, keys_of, read_prompt, read_state
+from turbopi.support.errors import ConfigError, ObservationError
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 DOCS = Path(__file__).parent.parent / "docs" / "robots.md"

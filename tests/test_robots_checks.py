@@ -13,10 +13,10 @@ import pytest
 from cli_helpers import refusal, text_of, turbopi
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.robots import Robot, RobotInputs
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
 TINY = ("--random-weights", "pi05_tiny")
 ARM = {

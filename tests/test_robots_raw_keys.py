@@ -11,11 +11,11 @@ from lerobot_golden import GOLDEN, GoldenCase
 
 from turbopi import UnifiedPolicy, serve
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi.recordings import iter_recording
 from turbopi.robots import Robot, create_robot, robot_for
 from turbopi.robots.raw_keys import ROBOT_TYPES
+from turbopi.support.errors import ConfigError, ObservationError
 
 SO101 = ROBOT_TYPES["so101_follower"]
 OPTIONS: dict[str, Any] = {
@@ -219,7 +219,7 @@ def test_an_openpi_checkpoint_takes_raw_keys_by_a_description(tmp_path: Path) ->
 def test_a_served_policy_answers_by_name_and_records_raw_keys(tmp_path: Path) -> None:
     from websockets.sync.client import connect
 
-    from turbopi.wire import pack, unpack
+    from turbopi.realtime.wire import pack, unpack
 
     checkpoint = random_checkpoint("pi05_tiny")
     file = tmp_path / "so101.json"

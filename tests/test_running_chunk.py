@@ -20,11 +20,11 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import RealTime
-from turbopi.errors import CheckpointError, ConfigError, ObservationError
-from turbopi.joining import Joining
-from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
-from turbopi.model.denoise import time_grid
-from turbopi.running_chunk import RunningChunk
+from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
+from turbopi.models.pi0.denoise import time_grid
+from turbopi.policy.chunk_conditioning import Joining
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
 H, A = 10, 32
 TRAINED = RealTime(trained_max_delay=3)

@@ -21,19 +21,20 @@ from websockets.sync.client import connect
 from turbopi.cli.fleet_update import Asked
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.serve_ray import FleetWishes, check_fits, check_runs
-from turbopi.client import RealTimeClient, ServerRefused
-from turbopi.errors import ConfigError
-from turbopi.serve import PolicyServer, ray_app, running
-from turbopi.serve.fleet import STARTED_HERE, TOKEN_LOGGER, FleetOptions, check_known, import_ray, reason_in
-from turbopi.serve.fleet import connect as connect_to_ray
+from turbopi.realtime.client import RealTimeClient, ServerRefused
+from turbopi.realtime.wire import pack, unpack
+from turbopi.serve import PolicyServer, running
+from turbopi.serve.fleet import ray_app
+from turbopi.serve.fleet.fleet import STARTED_HERE, TOKEN_LOGGER, FleetOptions, check_known, import_ray, reason_in
+from turbopi.serve.fleet.fleet import connect as connect_to_ray
+from turbopi.serve.fleet.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
+from turbopi.serve.fleet.remote_calls import RemoteCalls
+from turbopi.serve.fleet.replica import Line, Replica
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
-from turbopi.serve.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
-from turbopi.serve.remote_calls import RemoteCalls
-from turbopi.serve.replica import Line, Replica
-from turbopi.serve.schedule import Request
-from turbopi.wire import pack, unpack
+from turbopi.serve.scheduling.schedule import Request
+from turbopi.support.errors import ConfigError
 
 TINY = ("serve", "--random-weights", "pi05_tiny")
 
@@ -316,9 +317,9 @@ def test_what_autoscaling_has_and_ray_has_not_is_refused() -> None:
 def test_the_reason_is_found_in_rays_tracebacks() -> None:
     message = (
         'Deployment failed to start 3 times. Error:\n\x1b[36mray::Replica\x1b[39m (pid=1)\n  File "a.py", line 1\n'
-        "turbopi.errors.CheckpointError: no weights in /srv/x\n"
+        "turbopi.support.errors.CheckpointError: no weights in /srv/x\n"
     )
-    assert reason_in(message) == "turbopi.errors.CheckpointError: no weights in /srv/x"
+    assert reason_in(message) == "turbopi.support.errors.CheckpointError: no weights in /srv/x"
     assert reason_in("Waiting for a GPU.\nMore.") == "Waiting for a GPU."
 
 

@@ -29,9 +29,9 @@ from test_cli_serve import serving
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from turbopi.serve.homes import SOON_SECONDS
-from turbopi.shipped import load_frames
-from turbopi.wire import pack, unpack
+from turbopi.policy.shipped import load_frames
+from turbopi.realtime.wire import pack, unpack
+from turbopi.serve.fleet.session_affinity import SOON_SECONDS
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None, reason="needs Ray Serve: pip install -e '.[ray]'"

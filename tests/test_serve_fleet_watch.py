@@ -10,13 +10,14 @@ import pytest
 from serve_fakes import FakePolicy, http_get, observation, wait_for
 from websockets.sync.client import connect
 
-from turbopi.errors import DeviceLost
-from turbopi.serve import PolicyServer, fleet_watch, running, server
-from turbopi.serve.fleet_watch import Watch, answers
+from turbopi.realtime.wire import pack, unpack
+from turbopi.serve import PolicyServer, running, server
+from turbopi.serve.fleet import watch as fleet_watch
+from turbopi.serve.fleet.remote_calls import RemoteCalls
+from turbopi.serve.fleet.watch import Watch, answers
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.outcome import Outcome
-from turbopi.serve.remote_calls import RemoteCalls
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import DeviceLost
 
 MOST_SECONDS = 60.0
 

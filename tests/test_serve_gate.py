@@ -22,11 +22,11 @@ from serve_fakes import FakePolicy, http_get, observation
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from turbopi.errors import ConfigError
+from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
-from turbopi.wire import pack
+from turbopi.support.errors import ConfigError
 
 REASON = "CUDA error: an illegal memory access was encountered"
 

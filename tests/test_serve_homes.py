@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from turbopi.serve.homes import ACTIVE_SECONDS, MOST, SOON_SECONDS, Homes
-from turbopi.serve.replica import Line
+from turbopi.serve.fleet.replica import Line
+from turbopi.serve.fleet.session_affinity import ACTIVE_SECONDS, MOST, SOON_SECONDS, Homes
 
 
 def homes(clients: int, of: str = "left", at: float = 0.0) -> Homes:
@@ -64,9 +64,9 @@ def test_the_router_notes_answers_on_its_own_loop_although_ray_tells_of_them_on_
     routers.RequestRouter = object  # type: ignore[attr-defined]
     for module in (ray, serve, routers):
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.delitem(sys.modules, "turbopi.serve.ray_router", raising=False)
-    router = importlib.import_module("turbopi.serve.ray_router").FewestRequests()
-    monkeypatch.delitem(sys.modules, "turbopi.serve.ray_router")
+    monkeypatch.delitem(sys.modules, "turbopi.serve.fleet.ray_router", raising=False)
+    router = importlib.import_module("turbopi.serve.fleet.ray_router").FewestRequests()
+    monkeypatch.delitem(sys.modules, "turbopi.serve.fleet.ray_router")
     router.replica_queue_len_cache = {"left": 1, "right": 0}
     replicas = [SimpleNamespace(replica_id=name) for name in ("left", "right")]
     request = SimpleNamespace(args=({}, Line(source="a robot")))

@@ -15,14 +15,14 @@ from test_serve_server import client, eventually, metric, served
 from test_serve_several import HoldingJoins, answer
 from websockets.asyncio.client import ClientConnection
 
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.running_chunk import RunningChunk
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer, running
-from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.calls import PolicyCalls
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.schedule import Request, Schedule
-from turbopi.wire import pack
+from turbopi.serve.scheduling.batch_times import BatchTimes
+from turbopi.serve.scheduling.schedule import Request, Schedule
+from turbopi.support.errors import ConfigError, ObservationError
 
 GUIDED: dict[str, Any] = {"execution": "rtc", "control_hz": 50.0}
 

@@ -19,10 +19,10 @@ from test_serve_server import client, eventually, infer, metric, refused, served
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
-from turbopi.errors import ConfigError
+from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer, limits, listener
 from turbopi.serve.limits import AtMost, Limits, room_for_connections
-from turbopi.wire import pack
+from turbopi.support.errors import ConfigError
 
 NIL = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19_998  # 20 kB, 19 998 values
 

@@ -23,16 +23,16 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
 import turbopi.serve.page
+from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import PolicyServer, ServerOptions
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.page import live
 from turbopi.serve.page.device import memory_of
 from turbopi.serve.page.live import BINS, Live, stage_times
-from turbopi.serve.page.look import THUMBNAIL, look_at, thumbnail
 from turbopi.serve.page.messages import Frame, Hello, Look, clean
-from turbopi.serve.schedule import Schedule
-from turbopi.serve.worker import Worker
-from turbopi.wire import pack, unpack
+from turbopi.serve.page.preview import THUMBNAIL, look_at, thumbnail
+from turbopi.serve.scheduling.schedule import Schedule
+from turbopi.serve.scheduling.worker import Worker
 
 HTML = (Path(turbopi.serve.page.__file__).parent / "page.html").read_text(encoding="utf-8")
 FEED = msgspec.json.Decoder(Hello | Frame)

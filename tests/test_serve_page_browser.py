@@ -12,9 +12,9 @@ from chromium import PROGRAM, Page, chromium
 from serve_fakes import FakePolicy, observation
 from websockets.sync.client import connect
 
-from turbopi.errors import ObservationError
+from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer, running
-from turbopi.wire import pack
+from turbopi.support.errors import ObservationError
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: apt-get install chromium")
 

@@ -13,11 +13,11 @@ from tensorrt_fakes import on_twins
 from test_serve_server import client, eventually, infer, metric, refused, stop_while_the_client_has_left
 from websockets.exceptions import ConnectionClosed
 
-from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
+from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
 from turbopi.checkpoint import random_checkpoint
+from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import PolicyServer
-from turbopi.serve import worker as worker_module
-from turbopi.wire import pack, unpack
+from turbopi.serve.scheduling import worker as worker_module
 
 Test = Callable[[PolicyServer, PipelinedFakePolicy], Awaitable[None]]
 

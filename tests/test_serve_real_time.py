@@ -21,18 +21,18 @@ from websockets.sync.client import connect
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.client import RealTimeClient, ServerLost, ServerRefused
-from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.execution.messages import KEYS, message, read_message
 from turbopi.realtime import RealTimeExecutor
+from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
+from turbopi.realtime.messages import KEYS, message, read_message
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import iter_recording
-from turbopi.running_chunk import JoinMode, RunningChunk
 from turbopi.serve import PolicyServer, ServerOptions, run, running
 from turbopi.serve import real_time as sessions_module
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import JOINING
 from turbopi.serve.real_time import RealTime
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
 H, A = 10, 3
 REAL_TIME = {"modes": ["rtc", "rtc_identity", "rtc_trained"], "trained_max_delay": 2, "execution_horizon": None}
@@ -595,7 +595,7 @@ class Refuse:
 BLOCKED = {"torch", "msgspec", "matplotlib", "safetensors", "PIL", "typer", "rich", "sentencepiece", "tensorstore",
            "jinja2", "psutil", "packaging", "prometheus_client"}
 sys.meta_path.insert(0, Refuse())
-import turbopi.client, turbopi.realtime
+import turbopi.realtime.client, turbopi.realtime
 foreign = {name.split(".")[0] for name in sys.modules} & (BLOCKED | {"websockets", "msgpack", "numpy"})
 print(sorted(foreign))
 """
@@ -686,7 +686,7 @@ def faults(copies=20):
         del blocks
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-from turbopi.client import _keep_freed_memory
+from turbopi.realtime.client import _keep_freed_memory
 _keep_freed_memory()
 faults(1)
 print(faults())

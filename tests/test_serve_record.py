@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
-from turbopi.errors import ConfigError, ObservationError, OutputError
-from turbopi.files import append_line
 from turbopi.recordings import RecordedCall, Recorder, iter_recording, load_call, load_observation, save_call
 from turbopi.recordings import recorder as record
+from turbopi.support.errors import ConfigError, ObservationError, OutputError
+from turbopi.support.files import append_line
 
 RESULT = {
     "actions": np.arange(14.0).reshape(2, 7),
@@ -380,6 +380,6 @@ def test_a_manifest_that_cannot_be_written_ends_the_start(tmp_path: Path, monkey
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("turbopi.files.os.replace", full)
+    monkeypatch.setattr("turbopi.support.files.os.replace", full)
     with pytest.raises(ConfigError, match=r"manifest\.json"):
         Recorder(tmp_path, {})

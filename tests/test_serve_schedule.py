@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, LONGEST_PAUSE, PAUSE, BatchTimes
-from turbopi.serve.returns import MOST, Returns
-from turbopi.serve.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
+from turbopi.serve.scheduling.batch_times import FRESH_SECONDS, GAIN, KEPT, LONGEST_PAUSE, PAUSE, BatchTimes
+from turbopi.serve.scheduling.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
+from turbopi.serve.scheduling.think_time import MOST, Returns
 
 T1 = 0.01
 PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}  # seconds by size, of an engine that batches

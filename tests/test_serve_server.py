@@ -23,12 +23,12 @@ from serve_fakes import NO_CHUNKS, FakePolicy, PipelinedFakePolicy, http_get, ob
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 
-from turbopi.errors import ConfigError, DeviceLost
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.limits import Limits
 from turbopi.serve.server import SWITCH_SECONDS
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import ConfigError, DeviceLost
 
 
 def served(
@@ -357,7 +357,7 @@ def test_a_client_that_leaves_costs_nothing(how: str) -> None:
         ("crash", "RuntimeError: CUDA error: invalid argument"),
         ("stop iteration", "StopIteration"),
         ("exit", "SystemExit: 3"),
-        ("unpackable", "turbopi.wire.WireError: can't send a builtins.object"),
+        ("unpackable", "turbopi.realtime.wire.WireError: can't send a builtins.object"),
     ],
 )
 def test_a_failing_policy_sends_its_traceback_closes_1011_and_the_server_goes_on(prompt: str, last_line: str) -> None:

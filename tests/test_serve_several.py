@@ -21,20 +21,20 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosedError
 
 from turbopi import UnifiedPolicy
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.execution.messages import SCHEDULING_KEYS
+from turbopi.policy.shipped import CHASE_POLICY
+from turbopi.realtime.messages import SCHEDULING_KEYS
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, ServerOptions, running
-from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.calls import PolicyCalls
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.real_time import RealTime
 from turbopi.serve.rows import check_rows, row, stacked
-from turbopi.serve.schedule import Request, Schedule
+from turbopi.serve.scheduling.batch_times import BatchTimes
+from turbopi.serve.scheduling.schedule import Request, Schedule
+from turbopi.serve.scheduling.worker import Ran, Worker
 from turbopi.serve.urgency import MAX_ROWS, Urgency, read_urgency
-from turbopi.serve.worker import Ran, Worker
-from turbopi.shipped import CHASE_POLICY
-from turbopi.wire import pack, unpack
+from turbopi.support.errors import ConfigError, ObservationError
 
 PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}
 

@@ -19,9 +19,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from turbopi import wire
-from turbopi.errors import ObservationError
-from turbopi.wire import MAX_DEPTH, MAX_STEPS, MAX_VALUES, WireError, pack, unpack
+from turbopi.realtime import wire
+from turbopi.realtime.wire import MAX_DEPTH, MAX_STEPS, MAX_VALUES, WireError, pack, unpack
+from turbopi.support.errors import ObservationError
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "preprocess" / "msgpack.json").read_text())
 OBJECTS = {item["name"]: item for item in GOLDEN["objects"]}

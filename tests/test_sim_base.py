@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from turbopi.errors import ConfigError
-from turbopi.installation import install_command
 from turbopi.sim import SIMULATORS, SimSettings, SimulatorUnavailable, create, graphics, libero
 from turbopi.sim.base import full_suite_name
+from turbopi.support.errors import ConfigError
+from turbopi.support.installation import install_command
 
 
 def test_an_unknown_simulator_or_suite_is_refused_with_what_there_is() -> None:

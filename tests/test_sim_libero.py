@@ -14,8 +14,8 @@ from evaluate_fakes import SeekingPolicy
 from turbopi.evaluate.plan import Protocol, VideoPlan, choose_tasks, make_jobs
 from turbopi.evaluate.run import evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicyRefused
-from turbopi.policy import UnifiedPolicy
-from turbopi.shipped import SMALL_POLICY
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.sim import SimSettings, SimulatorUnavailable, create
 from turbopi.sim.libero import LiberoEnvironment, openpi_state
 

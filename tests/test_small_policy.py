@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from turbopi.checkpoint import open_checkpoint
-from turbopi.demo import expert_distance
-from turbopi.policy import UnifiedPolicy
-from turbopi.shipped import CHASE_POLICY, SMALL_POLICY, load_frames, observations
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.shipped import CHASE_POLICY, SMALL_POLICY, load_frames, observations
 from turbopi.sim import SimSettings
 from turbopi.sim.chase import ChaseEnvironment
+from turbopi.verify.demo import expert_distance
 
 PICTURES = ("observation/image", "observation/wrist_image")
 FRAMES = load_frames()

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from turbopi.config import Kind, Solver
 from turbopi.engine.conditioned import conditioned_loop
-from turbopi.engine.recent_loops import Loop
-from turbopi.errors import ObservationError
-from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes
-from turbopi.model.denoise import time_grid
-from turbopi.model.reference import Trace
-from turbopi.model.solvers import GRIDS, SOLVERS, Integration, evaluations_of, grid_times, intervals
+from turbopi.engine.graph_cache import Loop
+from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes
+from turbopi.models.pi0.denoise import time_grid
+from turbopi.models.pi0.reference import Trace
+from turbopi.models.pi0.solvers import GRIDS, SOLVERS, Integration, evaluations_of, grid_times, intervals
+from turbopi.support.errors import ObservationError
 
 assert kernels  # a fixture
 KINDS: list[Kind] = ["pi05", "pi0"]

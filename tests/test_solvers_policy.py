@@ -15,12 +15,12 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
-from turbopi.model.solvers import SOLVERS, Integration
-from turbopi.observation import Observation
-from turbopi.running_chunk import RunningChunk
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
+from turbopi.models.pi0.solvers import SOLVERS, Integration
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.support.errors import ConfigError, ObservationError
 
 UNEVEN = (1.0, 0.7, 0.2, 0.0)
 
@@ -121,9 +121,9 @@ def test_a_backend_without_solvers_refuses_when_the_policy_is_made_or_called(
 
 
 def test_the_other_backends_have_no_solvers() -> None:
-    from turbopi.backends.onnx import OnnxBackend
+    from turbopi.backends.onnx.backend import OnnxBackend
     from turbopi.backends.pytorch_compile import PyTorchCompileBackend
-    from turbopi.backends.tensorrt import TensorRTBackend
+    from turbopi.backends.tensorrt.backend import TensorRTBackend
 
     for backend in (OnnxBackend, PyTorchCompileBackend, TensorRTBackend):
         assert "solver" not in getattr(backend, "forms", ())

@@ -11,8 +11,8 @@ from torch import Tensor
 from turbopi import UnifiedPolicy
 from turbopi.backends import Sample
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.support.errors import ConfigError, ObservationError
 
 
 @pytest.fixture(scope="module")

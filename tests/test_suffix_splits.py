@@ -7,7 +7,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.kernels import plain_batch
 from turbopi.kernels.portable import batch
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.layers import rope_tables
 
 HEADS, DIM, TOKENS, LENGTHS = 2, 32, 3, (300, 0, 129)
 INVERSE = 55.0

@@ -12,12 +12,12 @@ from conftest import golden_cases, golden_folder, golden_model
 from tensorrt_fakes import golden_backend
 
 from turbopi import backends
-from turbopi.backends.tensorrt import TensorRTBackend
-from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
-from turbopi.errors import BackendError
-from turbopi.installation import install_command
-from turbopi.observation import Observation
-from turbopi.tensorrt.parts import EngineShape
+from turbopi.backends.tensorrt.backend import TensorRTBackend
+from turbopi.backends.tensorrt.parts import EngineShape
+from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
+from turbopi.models.observation import Observation
+from turbopi.support.errors import BackendError
+from turbopi.support.installation import install_command
 from turbopi.verify.check_golden import check_case
 
 H = golden_folder().checkpoint("pi05").config.model.action_horizon
@@ -175,7 +175,7 @@ def test_a_failing_observation_frees_its_buffers(tmp_path: Path) -> None:
 def test_waiting_for_free_buffers_is_told_apart_from_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, backend = golden_cases()["a_three_cams"], golden_backend(TensorRTPipelinedBackend, "pi05", tmp_path)
     now = [10.0]
-    monkeypatch.setattr("turbopi.backends.tensorrt_pipelined.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr("turbopi.backends.tensorrt.pipelined.time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     class Busy(threading.Semaphore):
         def acquire(self, *arguments: Any) -> bool:
@@ -203,7 +203,7 @@ def test_submit_takes_one_observation() -> None:
 
 @pytest.mark.parametrize("name", ["tensorrt", "tensorrt_pipelined", "tensorrt_fp8"])
 def test_a_machine_without_the_library_is_told_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.importlib.util.find_spec", lambda name: None)
     reason = backends.availability(name, torch.device("cpu"))
     assert reason is not None and "neither tensorrt_rtx nor tensorrt is installed; " in reason
     assert install_command("tensorrt") in reason

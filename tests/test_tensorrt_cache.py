@@ -19,15 +19,15 @@ from conftest import golden_model
 from file_helpers import no_room
 from tensorrt_fakes import ENVIRONMENT
 
-from turbopi import tensorrt
+from turbopi.backends import tensorrt
+from turbopi.backends.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
+from turbopi.backends.tensorrt.engine import Input, Kernels, Specification, build
+from turbopi.backends.tensorrt.networks import Fp8Scales
+from turbopi.backends.tensorrt.ops import NetworkOps, Value
+from turbopi.backends.tensorrt.parts import EngineShape, fingerprint
 from turbopi.config import Kind
-from turbopi.errors import BackendError, BackendUnavailable, OutputError
-from turbopi.installation import install_command
-from turbopi.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
-from turbopi.tensorrt.engine import Input, Kernels, Specification, build
-from turbopi.tensorrt.networks import Fp8Scales
-from turbopi.tensorrt.ops import NetworkOps, Value
-from turbopi.tensorrt.parts import EngineShape, fingerprint
+from turbopi.support.errors import BackendError, BackendUnavailable, OutputError
+from turbopi.support.installation import install_command
 
 needs_rtx = pytest.mark.skipif(importlib.util.find_spec("tensorrt_rtx") is None, reason="TensorRT-RTX isn't installed")
 
@@ -202,7 +202,7 @@ def nothing_imported() -> Iterator[None]:
 
 
 def test_no_library_is_an_error_with_the_command(monkeypatch: pytest.MonkeyPatch, nothing_imported: None) -> None:
-    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.importlib.util.find_spec", lambda name: None)
     said = f"neither tensorrt_rtx nor tensorrt is installed; {install_command('tensorrt')} (TensorRT-RTX"
     with pytest.raises(BackendUnavailable, match=re.escape(said)):
         tensorrt.library()
@@ -217,7 +217,7 @@ def test_the_first_library_that_is_installed_is_taken(
     monkeypatch.syspath_prepend(str(tmp_path))
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        "turbopi.tensorrt.importlib.util.find_spec", lambda name: found(name) if name in installed else None
+        "turbopi.backends.tensorrt.importlib.util.find_spec", lambda name: found(name) if name in installed else None
     )
     library = tensorrt.library()
     assert (library.name, library.version, library.is_rtx) == (installed[0], "7.7", installed[0] == "tensorrt_rtx")
@@ -249,8 +249,8 @@ def test_every_engine_of_a_model_is_built_without_a_gpu(kind: Kind, fp8: bool, t
     """FP8 from TensorRT-RTX 1.7 on: 1.4 asks the GPU for something."""
     if fp8 and tuple(map(int, tensorrt.library().version.split(".")[:2])) < (1, 7):
         pytest.skip("TensorRT-RTX before 1.7 builds FP8 on a GPU alone")
+    from turbopi.backends.tensorrt.engines import ModelEngines
     from turbopi.engine.weights import pack
-    from turbopi.tensorrt.engines import ModelEngines
 
     model = golden_model(kind, "bf16")
     one_scale = Fp8Scales(*(torch.tensor(0.01) for _ in range(5)))
@@ -288,7 +288,7 @@ def test_build_refuses_before_it_loads(monkeypatch: pytest.MonkeyPatch) -> None:
         turbopi("build", *tiny, "--precision", "int4")
     )
     assert "--calibration is for --precision fp8" in refusal(turbopi("build", *tiny, "--calibration", "x"))
-    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("build", *tiny, "--device", "cpu"))
     assert "can't build engines for tensorrt: neither tensorrt_rtx nor tensorrt is installed; " in said
     assert install_command("tensorrt") in said
@@ -305,7 +305,7 @@ def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) 
 def test_an_engine_that_doesnt_fit_its_workspace_is_refused(
     cache: EngineCache, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("turbopi.tensorrt.engine.WORKSPACE", 1024)
+    monkeypatch.setattr("turbopi.backends.tensorrt.engine.WORKSPACE", 1024)
 
     def write(ops: NetworkOps, inputs: dict[str, Value]) -> dict[str, Value]:
         return {"y": ops.matmul(inputs["x"], inputs["x"])}

@@ -10,13 +10,13 @@ import torch
 from conftest import golden_cases, golden_folder, golden_model
 from tensorrt_fakes import golden_backend
 
-from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
-from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.installation import install_command
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
-from turbopi.tensorrt import calibrate as calibrating
-from turbopi.tensorrt.calibrate import Calibration, calibrate
+from turbopi.backends.tensorrt import calibrate as calibrating
+from turbopi.backends.tensorrt.calibrate import Calibration, calibrate
+from turbopi.backends.tensorrt.fp8 import TensorRTFp8Backend
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.installation import install_command
 
 NAMES = ("input", "hidden", "gate", "up", "down")
 needs_modelopt = pytest.mark.skipif(importlib.util.find_spec("modelopt") is None, reason="ModelOpt isn't installed")
@@ -95,7 +95,7 @@ def test_nothing_to_calibrate_on_is_refused() -> None:
 
 
 def test_modelopt_that_is_missing_is_never_imitated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("turbopi.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
     with pytest.raises(BackendUnavailable, match=re.escape(f"{install_command('modelopt')}, or take --method max")):
         calibrate(golden_model("pi05"), observations(), method="modelopt")
 

@@ -11,20 +11,21 @@ import pytest
 import torch
 from conftest import golden_cases, golden_folder, golden_model
 
-from turbopi import backends, tensorrt
-from turbopi.backends.tensorrt import TensorRTBackend
-from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
-from turbopi.errors import BackendError
-from turbopi.model.denoise import time_embedding, time_grid
-from turbopi.model.vision import normalize_images
-from turbopi.observation import Observation
-from turbopi.tensorrt.calibrate import calibrate, unavailable
-from turbopi.tensorrt.engine import Engine, Input, Kernels, Specification, build
-from turbopi.tensorrt.ops import NetworkOps
+from turbopi import backends
+from turbopi.backends import tensorrt
+from turbopi.backends.tensorrt.backend import TensorRTBackend
+from turbopi.backends.tensorrt.calibrate import calibrate, unavailable
+from turbopi.backends.tensorrt.engine import Engine, Input, Kernels, Specification, build
+from turbopi.backends.tensorrt.fp8 import TensorRTFp8Backend
+from turbopi.backends.tensorrt.ops import NetworkOps
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.denoise import time_embedding, time_grid
+from turbopi.models.pi0.vision import normalize_images
+from turbopi.support.errors import BackendError
 from turbopi.verify.check_golden import check_case
 
 if TYPE_CHECKING:
-    from turbopi.export.onnx import Export
+    from turbopi.backends.onnx.export import Export
 
 pytestmark = [
     pytest.mark.gpu,
@@ -100,7 +101,7 @@ def test_fp8_actions_point_the_same_way(
 def exports(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], "Export"]:
     """The golden model's export, float32 or with FP8; each is made once."""
     pytest.importorskip("onnxruntime")
-    from turbopi.export.onnx import export_onnx
+    from turbopi.backends.onnx.export import export_onnx
 
     @cache
     def export(fp8: bool) -> "Export":
@@ -120,9 +121,9 @@ def test_an_exported_graph_is_an_engine(
     graph: str, fp8: bool, exports: Callable[[bool], "Export"], record_property: Callable[[str, object], None]
 ) -> None:
     """Float32 products are TF32 in TensorRT-RTX, hence the bound; FP8 is compared with ONNX Runtime's FP8."""
-    from turbopi.backends.onnx import Sessions
-    from turbopi.export.shapes import shapes_of
-    from turbopi.tensorrt.engine import build_onnx
+    from turbopi.backends.onnx.backend import Sessions
+    from turbopi.backends.onnx.shapes import shapes_of
+    from turbopi.backends.tensorrt.engine import build_onnx
 
     export = exports(fp8)
     inputs = graph_inputs(graph)

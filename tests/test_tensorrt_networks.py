@@ -6,14 +6,14 @@ import torch.nn.functional as F
 from conftest import golden_cases, golden_model
 from torch import Tensor
 
+from turbopi.backends.tensorrt import networks
+from turbopi.backends.tensorrt.ops import FP8_MAX, TorchOps, to_fp8
 from turbopi.config import Kind
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.kernels.plain import embed_patches
-from turbopi.model.denoise import time_embedding, time_grid
-from turbopi.model.layers import rope_tables
-from turbopi.model.vision import normalize_images
-from turbopi.tensorrt import networks
-from turbopi.tensorrt.ops import FP8_MAX, TorchOps, to_fp8
+from turbopi.models.pi0.denoise import time_embedding, time_grid
+from turbopi.models.pi0.layers import rope_tables
+from turbopi.models.pi0.vision import normalize_images
 
 OPS = TorchOps()
 

@@ -17,7 +17,6 @@ from lerobot_cases import tokenizer_folder
 
 import turbopi
 from turbopi.config import preset
-from turbopi.errors import ObservationError, TokenizerError
 from turbopi.preprocess.tokenizer import (
     TINY_TOKENIZER,
     PromptTokenizer,
@@ -26,6 +25,7 @@ from turbopi.preprocess.tokenizer import (
     prompt_texts,
     state_bins,
 )
+from turbopi.support.errors import ObservationError, TokenizerError
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 PROMPTS: list[dict[str, Any]] = json.loads((FOLDER / "prompts.json").read_text())

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from turbopi.toolchain import make_caches_writable
+from turbopi.support.toolchain import make_caches_writable
 
 TRITON, INDUCTOR = "TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR"
 

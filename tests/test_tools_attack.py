@@ -29,9 +29,9 @@ from attack.specimens import SPECIMENS, read_observation
 from attack.websocket import check_loopback
 from rich.console import Console
 
+from turbopi.realtime.wire import WireError, pack, unpack
 from turbopi.recordings import Recorder
 from turbopi.serve import running
-from turbopi.wire import WireError, pack, unpack
 
 OBSERVATION = {"observation/state": np.linspace(-1, 1, 8), "prompt": "lift", "more": [1, 2.5, b"x", None, {"a": True}]}
 MESSAGE = pack(OBSERVATION)

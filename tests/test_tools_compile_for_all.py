@@ -14,7 +14,7 @@ from compile_for_all.allowed import ALLOWED, allowed
 from compile_for_all.document import Compiled, CompiledForAll, read_compiled, replaced, written
 from compile_for_all.targets import TARGETS, over_limit
 
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 ALL = {"sm_80", "sm_86", "sm_87", "sm_89", "sm_90a", "sm_100a", "sm_103a", "sm_110a", "sm_120a", "sm_121a"}

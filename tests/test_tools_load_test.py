@@ -21,10 +21,10 @@ from rich.console import Console
 from serve_fakes import FakePolicy
 from test_serve_openpi_client import openpi_client
 
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.reading import plain_document
+from turbopi.realtime.wire import pack
 from turbopi.serve import running
-from turbopi.wire import pack
+from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.reading import plain_document
 
 # --- when requests are sent -------------------------------------------------------------------------------------------
 

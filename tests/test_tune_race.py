@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import pytest
 
-from turbopi.errors import DeviceLost
 from turbopi.kernels.tile_table import NO_TILES, Knobs, TileKey, TileTable
+from turbopi.support.errors import DeviceLost
 from turbopi.tune import race as racing
 from turbopi.tune.race import FINALISTS, MARGIN, Round, Timed, UsualFails, race, winner
 from turbopi.tune.run import Measured, Outcome, Planned, Progress, gained_ms, tune, tuned_tile

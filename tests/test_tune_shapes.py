@@ -14,7 +14,7 @@ from torch import Tensor
 from turbopi.config import Kind, preset
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
 from turbopi.engine.call import CallShape, Pictures
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.runner import BUCKET, bucket
 from turbopi.engine.weights import modulation, pack
 from turbopi.kernels.interface import Ops, Segments

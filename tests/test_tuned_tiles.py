@@ -25,7 +25,6 @@ from turbopi.backends.tuned_tiles import (
     tuned_off,
     write_tile_file,
 )
-from turbopi.errors import ConfigError, OutputError
 from turbopi.kernels.portable import attention_tiles
 from turbopi.kernels.portable.gemm import tiles as portable
 from turbopi.kernels.portable.gemm.tiles import Tile
@@ -34,7 +33,8 @@ from turbopi.kernels.sm90.gemm import tiles as hopper_tiles
 from turbopi.kernels.sm90.gemm.bf16 import Tile as HopperTile
 from turbopi.kernels.tile_checks import why_not
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileKey, TileTable
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError, OutputError
+from turbopi.support.reading import plain_document
 
 HOPPER = Machine("NVIDIA H200", (9, 0), 132, "580.95.05", "3.6.0")
 

@@ -14,14 +14,14 @@ from cli_helpers import refusal, turbopi
 
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import CheckpointError
-from turbopi.examples import Example, NoisyExample
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import ModelInputs
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document, read_document
+from turbopi.models.observation import ModelInputs
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy.examples import Example, NoisyExample
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import plain_document, read_document
 from turbopi.verify.check_golden import _compare_rounded, check_case
 from turbopi.verify.document import Certificate, Judged
 from turbopi.verify.golden import GoldenFolder, Run

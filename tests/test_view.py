@@ -22,14 +22,14 @@ from websockets.sync.client import connect
 from websockets.sync.server import serve
 
 from turbopi import view
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.realtime.wire import pack
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.serve import PolicyServer, running
+from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.view.calls import ViewedCall, ViewedTrouble
 from turbopi.view.live import LiveServer
 from turbopi.view.recorded import recorded, robot_of
 from turbopi.view.viewer import COMMAND, Viewer, open_viewer
-from turbopi.wire import pack
 
 with_rerun = pytest.mark.skipif(find_spec("rerun") is None, reason="needs rerun: pip install -e '.[view]'")
 RANDOM = np.random.default_rng(27)

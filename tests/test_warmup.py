@@ -17,10 +17,10 @@ from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.engine.runner import HostRow
-from turbopi.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
-from turbopi.observation import Observation, with_cameras
+from turbopi.models.observation import Observation, with_cameras
 from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
+from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
 
 H = 10
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from turbopi.wording import data_size, did_you_mean, names_known, significant
+from turbopi.support.text import data_size, did_you_mean, names_known, significant
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from turbopi.backends import Sample
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model, Trace
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model, Trace
 
 FAULTY_LAYER = 2
 FAULTY_STEP = 1

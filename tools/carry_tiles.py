@@ -27,14 +27,14 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from turbopi.backends.tuned_tiles import PACKAGE, SHIPPED, SOURCES, TileFile, TunedTile, fingerprint, write_tile_file
-from turbopi.errors import ConfigError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.kernels.sm90.gemm.candidates import epilogue_with
 from turbopi.kernels.sm90.gemm.products import ADDING_ROWS, from_knobs
-from turbopi.reading import read_document
-from turbopi.source_code import code_of
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document
+from turbopi.support.source_code import code_of
 
 ARCH = "sm_90a"
 PARTS = 12  # of the sums of a row: any number gives a kernel of that form

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from turbopi.provenance import provenance
-from turbopi.reading import plain_document
 from turbopi.robots import create_robot
+from turbopi.support.provenance import provenance
+from turbopi.support.reading import plain_document
 
 POLICY = Path(__file__).parents[1] / "src" / "turbopi" / "data" / "small_policy"
 CALLS = """

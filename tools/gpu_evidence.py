@@ -12,10 +12,10 @@ from pathlib import Path
 
 from msgspec import UNSET, Struct, UnsetType
 
-from turbopi.errors import ConfigError
-from turbopi.provenance import Provenance
-from turbopi.reading import read_document
-from turbopi.source_code import code_of
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import read_document
+from turbopi.support.source_code import code_of
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results"
@@ -29,18 +29,37 @@ PRODUCT = (
         "src/turbopi/quantization/*",
         "src/turbopi/calibrate/*",
         "src/turbopi/config.py",
-        "src/turbopi/observation.py",
+        "src/turbopi/models/observation.py",
     ),
     "src/turbopi/verify/check_golden.py",
 )
 # Modules that only read files, format text or hand tensors on: CPU tests see all of what they do.
 HOST_ONLY = (
-    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.shipped"),
-    *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
-    *("turbopi.provenance", "turbopi.toolchain", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
-    *("turbopi.policy", "turbopi.joining", "turbopi.model_call", "turbopi.running_chunk", "turbopi.source_code"),
-    "turbopi.extensions",
-    "turbopi.backends.onnx",  # refuses every device but the CPU
+    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.policy.shipped"),
+    *(
+        "turbopi.backends.onnx",
+        "turbopi.backends.tensorrt",
+        "turbopi.support.errors",
+        "turbopi.support.files",
+        "turbopi.support.reading",
+        "turbopi.policy.call_options",
+    ),
+    *(
+        "turbopi.support.provenance",
+        "turbopi.support.toolchain",
+        "turbopi.recordings",
+        "turbopi.policy.examples",
+        "turbopi.verify.golden",
+    ),
+    *(
+        "turbopi.policy.policy",
+        "turbopi.policy.chunk_conditioning",
+        "turbopi.policy.model_call",
+        "turbopi.realtime.running_chunk",
+        "turbopi.support.source_code",
+    ),
+    "turbopi.support.extensions",
+    "turbopi.backends.onnx.backend",  # refuses every device but the CPU
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 from turbopi.config import preset
-from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.attention import suffix
@@ -23,6 +22,7 @@ from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.kernels.sm90.instructions import SHARED_BYTES
 from turbopi.kernels.sm90.norms import layer_norm
+from turbopi.support.errors import BackendError
 
 ARCH = "sm_90a"
 CACHE_ROWS = 976  # of `fused` with three cameras and prompts of up to 200 tokens

@@ -4,15 +4,22 @@ The names in `__all__` are the public interface, with those that docs/api.md lis
 """
 
 import importlib
+import importlib.abc
+import importlib.util
 import os
 import sys
+import warnings
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from turbopi import errors
     from turbopi.checkpoint import open_checkpoint
     from turbopi.config import PolicyConfig
-    from turbopi.errors import (
+    from turbopi.policy.policy import UnifiedPolicy
+    from turbopi.robots import Robot, RobotInputs
+    from turbopi.support import errors
+    from turbopi.support.errors import (
         ActionError,
         BackendError,
         BackendUnavailable,
@@ -25,8 +32,6 @@ if TYPE_CHECKING:
         TokenizerError,
         TurboPiError,
     )
-    from turbopi.policy import UnifiedPolicy
-    from turbopi.robots import Robot, RobotInputs
 
     __version__: str
 
@@ -72,7 +77,7 @@ def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'turbopi' has no attribute {name!r}")
     if name == "errors":
-        return importlib.import_module("turbopi.errors")
+        return importlib.import_module("turbopi.support.errors")
     try:
         module = importlib.import_module(f"turbopi.{_MODULES.get(name, 'errors')}")
     except ModuleNotFoundError as missing:
@@ -80,10 +85,58 @@ def __getattr__(name: str) -> object:
             raise
         raise ImportError(
             f"turbopi.{name} needs PyTorch, which isn't installed: scripts/setup of Turbo-Pi's clone does it. A "
-            "robot's computer that asks a server needs turbopi.client alone, without PyTorch (docs/real_time.md)",
+            "robot's computer that calls a server needs turbopi.realtime alone, without PyTorch (docs/real_time.md)",
             name="torch",
         ) from missing
     return getattr(module, name)
+
+
+# Names of 0.1's modules, found for one version more. `turbopi.errors` stays a public name.
+_MOVED = {
+    "arguments": "policy.call_options",
+    "client": "realtime.client",
+    "errors": "support.errors",
+    "examples": "policy.examples",
+    "execution": "realtime",
+    "files": "support.files",
+    "joining": "policy.chunk_conditioning",
+    "model": "models.pi0",
+    "model_call": "policy.model_call",
+    "observation": "models.observation",
+    "plots": "support.plots",
+    "provenance": "support.provenance",
+    "reading": "support.reading",
+    "running_chunk": "realtime.running_chunk",
+    "serve.schedule": "serve.scheduling.schedule",
+    "shipped": "policy.shipped",
+    "wire": "realtime.wire",
+}
+
+
+class _MovedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds a moved module, or one inside a moved folder, under its name of 0.1: the same module object."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        for old, new in _MOVED.items():
+            if fullname == f"turbopi.{old}" or fullname.startswith(f"turbopi.{old}."):
+                moved = f"turbopi.{new}{fullname.removeprefix(f'turbopi.{old}')}"
+                return importlib.util.spec_from_loader(fullname, self, origin=moved)
+        return None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        if spec.name != "turbopi.errors":
+            warnings.warn(f"{spec.name} is {spec.origin} now", DeprecationWarning, stacklevel=2)
+        module = importlib.import_module(str(spec.origin))
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        # it has run under its own name; what imports it has put the old name's spec there
+        assert module.__spec__ is not None
+        module.__spec__ = module.__spec__.loader_state
+
+
+sys.meta_path.insert(0, _MovedModules())  # first: a moved folder would find its files a second time
 
 
 def __dir__() -> list[str]:

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from turbopi.errors import ConfigError
-from turbopi.reading import is_finite, is_integer, shown
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import is_finite, is_integer, shown
 
 Kind = Literal["pi05", "pi0"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
@@ -38,10 +38,10 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
-Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: model/conditioning.py
+Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: models/pi0/conditioning.py
 Solver = Literal[
     "euler", "midpoint", "heun", "ab2", "exponential"
-]  # of the flow from noise to actions: model/solvers.py
+]  # of the flow from noise to actions: models/pi0/solvers.py
 GridName = Literal["uniform", "shifted_to_noise", "shifted_to_actions"]
 TimeGrid = GridName | Sequence[float]  # or times, strictly falling from 1 to 0
 

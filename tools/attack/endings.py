@@ -21,9 +21,9 @@ from attack.judging import Bar, digest_actions
 from attack.messages import observation
 from attack.server import GoodClient, ServerProcess, environment
 from attack.websocket import PING, Raw, frame, header
-from turbopi.errors import TurboPiError
+from turbopi.realtime.wire import pack
 from turbopi.recordings import load_call
-from turbopi.wire import pack
+from turbopi.support.errors import TurboPiError
 
 END_S = 20.0  # a SIGTERM is obeyed within, whatever clients do
 WAIT_S = 60.0  # after which a server that doesn't end is killed

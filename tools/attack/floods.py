@@ -10,7 +10,7 @@ from attack.arena import Arena
 from attack.judging import TRACEBACK
 from attack.messages import observation
 from attack.websocket import PING, HandshakeRefused, Raw, frame, header, request
-from turbopi.wire import pack
+from turbopi.realtime.wire import pack
 
 SLOW_WALK = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19998  # as many values as a message may have: the most work a byte
 # The most headers of different kinds that a message may have, which no run of equal ones makes cheap.

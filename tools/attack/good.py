@@ -15,7 +15,7 @@ import numpy as np
 from attack.fake import NAME
 from attack.judging import decode, judge, shape_fault
 from attack.websocket import Blocking, HandshakeRefused
-from turbopi.wire import pack
+from turbopi.realtime.wire import pack
 
 PAUSE_S = 0.005  # what a robot does between its calls
 RETRY_S = 0.1

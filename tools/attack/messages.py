@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from attack.websocket import BINARY, CLOSE, PING, PONG, TEXT, frame, header
-from turbopi.wire import pack
+from turbopi.realtime.wire import pack
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from rich.table import Table
 
 from attack.arena import MAX_VIOLATIONS, Found
 from attack.attacks import ATTACKS, Attack, Size
-from turbopi.errors import ConfigError
-from turbopi.provenance import Provenance, provenance
-from turbopi.reading import plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Provenance, provenance
+from turbopi.support.reading import plain_document, read_document
 
 MAX_BYTES = 1 << 28
 COLUMNS = 80  # that the table fits into

@@ -33,7 +33,7 @@ def command(policy: Policy, options: Sequence[str] = ()) -> list[str]:
     if kind == "fake":
         return [sys.executable, "-m", "attack.fake", "--milliseconds", str(float(number or 20)), "--", *options]
     if kind == "small":
-        from turbopi.shipped import SMALL_POLICY
+        from turbopi.policy.shipped import SMALL_POLICY
 
         return [sys.executable, "-m", "turbopi", "serve", str(SMALL_POLICY), *options]
     if re.fullmatch(r"pi0\w*", kind):

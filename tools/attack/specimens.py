@@ -41,7 +41,7 @@ def _helpers() -> Any:
 
 def observation() -> dict[str, Any]:
     """One of LIBERO's, as a robot sends it."""
-    from turbopi.shipped import load_frames
+    from turbopi.policy.shipped import load_frames
 
     frame = load_frames()[0]
     return {

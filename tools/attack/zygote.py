@@ -28,7 +28,15 @@ from attack.server import environment
 
 MAX_OUTPUT = 20_000  # characters of stdout and stderr that are looked at, from their ends
 POLL_S = 0.02
-_IMPORTS = ("torch", "numpy", "PIL.Image", "turbopi.cli", "turbopi.policy", "turbopi.checkpoint", "turbopi.serve")
+_IMPORTS = (
+    "torch",
+    "numpy",
+    "PIL.Image",
+    "turbopi.cli",
+    "turbopi.policy.policy",
+    "turbopi.checkpoint",
+    "turbopi.serve",
+)
 
 
 @dataclass(frozen=True)

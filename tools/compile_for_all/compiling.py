@@ -27,13 +27,13 @@ from compile_for_all.document import Compiled
 from compile_for_all.launches import Launch, launches
 from compile_for_all.targets import MULTIPROCESSORS, Target, over_limit
 from turbopi.config import preset
-from turbopi.errors import BackendError
 from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 from turbopi.kernels.sm90.vjp import products as vjp
-from turbopi.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
+from turbopi.support.errors import BackendError
+from turbopi.support.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
 
 HOPPER, THOR = (9, 0), (11, 0)
 

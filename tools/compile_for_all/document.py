@@ -5,8 +5,8 @@ from pathlib import Path
 
 from msgspec import Struct, structs
 
-from turbopi.errors import ConfigError
-from turbopi.reading import plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document, read_document
 
 
 class _Found(Struct, frozen=True, omit_defaults=True):

@@ -3,8 +3,8 @@
 from turbopi.bench.batch_table import published_table
 from turbopi.bench.gpus import find_gpu
 from turbopi.bench.measured import measured_calls
-from turbopi.errors import ConfigError
-from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, plan_fleet
+from turbopi.serve.fleet.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, plan_fleet
+from turbopi.support.errors import ConfigError
 
 GPUS = (("h200", "fp8"), ("h200", "bf16"), ("h100", "fp8"), ("h100", "bf16"), ("rtx4090", "bf16"))
 ROBOTS = (4, 8, 16, 32, 64)

@@ -25,7 +25,7 @@ from turbopi.bench.predict import Prediction, predict
 from turbopi.bench.work import Job
 from turbopi.cli.predict import call_text
 from turbopi.config import ModelConfig
-from turbopi.errors import TurboPiError
+from turbopi.support.errors import TurboPiError
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TESTED = "*_gpu_check.json"
@@ -43,7 +43,7 @@ def pretended(capability: tuple[int, int]) -> Iterator[None]:
         patch.object(torch.cuda, "get_device_capability", lambda device=None: capability),
         patch("importlib.util.find_spec", found),
         patch.object(shutil, "which", lambda name, *rest: f"/usr/bin/{name}"),
-        patch("turbopi.toolchain._missing_headers", lambda: None),
+        patch("turbopi.support.toolchain._missing_headers", lambda: None),
     ):
         yield
 

@@ -10,8 +10,8 @@ from turbopi.bench.document import Result, Times, read_benchmark
 from turbopi.bench.measured import Kernels, MeasuredCall
 from turbopi.bench.predict import STAGES
 from turbopi.bench.work import Job
-from turbopi.errors import ConfigError
-from turbopi.reading import plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document, read_document
 
 SOURCES = Path("benchmarks") / "measured.json"
 RESULTS = Path("benchmarks") / "results"

@@ -20,9 +20,9 @@ from doc_tables.drawn import compacted
 from turbopi.bench.document import read_benchmark
 from turbopi.bench.plots import DRAWN_OF
 from turbopi.bench.work import Job
-from turbopi.errors import ConfigError
-from turbopi.plots import MEASURED, MUTED, write_figure
-from turbopi.reading import as_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.plots import MEASURED, MUTED, write_figure
+from turbopi.support.reading import as_document
 
 FOLDER = Path("benchmarks") / "results" / "h200_2026-11-28_peers"
 RUNS = ("ours_beside_flashrt_openpi.json", "flashrt_openpi.jsonl", "realtime_vla.txt", "lerobot.jsonl")

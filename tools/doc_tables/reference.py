@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import turbopi
-from turbopi import config, errors
+from turbopi import config
 from turbopi.checkpoint import Checkpoint
+from turbopi.support import errors
 
 DOCUMENT = Path("docs") / "api_reference.md"
 _INTRODUCTION = """# Python reference

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from doc_tables.drawn import compacted
-from turbopi.errors import ConfigError
-from turbopi.reading import read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document
 from turbopi_lab.studies import report
 from turbopi_lab.studies.report import Report, table_lines
 

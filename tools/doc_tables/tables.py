@@ -14,8 +14,8 @@ from doc_tables.peers import peers, read_run
 from doc_tables.studies import few_steps, read_report, study
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.bench.work import JOINS
-from turbopi.provenance import Gpu
-from turbopi.wording import significant
+from turbopi.support.provenance import Gpu
+from turbopi.support.text import significant
 
 if TYPE_CHECKING:
     from attack.results import Piece

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kernel_turns.variants import Variant
-from turbopi.errors import BackendError
+from turbopi.support.errors import BackendError
 
 MULTIPLYING, WARPS = 16, 20  # warps of a block
 
@@ -62,8 +62,8 @@ def main() -> None:
 def _time(arguments: argparse.Namespace) -> None:
     from kernel_turns.document import MarkedVariant, TimedVariant, TurnsDocument
     from kernel_turns.turns import GPU, MARKS, RANKS, Job, marks_by_rank, time_in_turns
-    from turbopi.provenance import provenance
-    from turbopi.reading import plain_document
+    from turbopi.support.provenance import provenance
+    from turbopi.support.reading import plain_document
 
     variants, console = [Variant(spec) for spec in arguments.variants], Console()
     rows, marks = list[TimedVariant](), list[MarkedVariant]()

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from msgspec import UNSET, Struct, UnsetType
 
-from turbopi.errors import ConfigError
-from turbopi.provenance import Provenance
-from turbopi.reading import read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import read_document
 
 
 class TimedVariant(Struct, frozen=True):

@@ -8,16 +8,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import GemmaConfig, ModelConfig, preset
-from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.interface import GemmaLayer, TokenInputs
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.packing import KINDS
 from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain, guided
-from turbopi.model.denoise import euler_step
-from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
+from turbopi.models.pi0.denoise import euler_step
+from turbopi.models.pi0.layers import apply_rope, rms_normalize, rope_tables
 from turbopi.quantization.fp8 import E4M3_MAX
+from turbopi.support.errors import BackendError
 
 FULL = preset("pi05_libero").model
 BF16 = torch.bfloat16

@@ -25,11 +25,11 @@ from msgspec import Struct
 from kernel_turns.portable import packed_in
 from kernel_turns.problems import GPU, plain, portable_outputs, problem, relative, standing_for
 from turbopi.backends.tuned_tiles import knobs_text
-from turbopi.errors import ConfigError
 from turbopi.kernels.portable.denoise.kernel import unavailable
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
-from turbopi.provenance import Provenance, provenance
-from turbopi.reading import plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Provenance, provenance
+from turbopi.support.reading import plain_document, read_document
 
 KERNEL, SEED = "denoise.kernel", 11
 TRITON = ((8, 0), (8, 6), (8, 9))  # what Triton's kernels are compiled for

@@ -14,10 +14,10 @@ from pathlib import Path
 from kernel_turns.turns import CACHE_ROWS
 from kernel_turns.variants import Variant
 from turbopi.config import preset
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.denoise.packing import Arrangement
 from turbopi.kernels.sm90.instructions import SHARED_BYTES
+from turbopi.support.errors import BackendUnavailable
 
 KERNEL = "turbopi_denoise"
 _INSTRUCTION = re.compile(r"/\*[0-9a-f]{4,5}\*/\s+(.*?);")

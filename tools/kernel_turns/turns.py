@@ -13,9 +13,9 @@ from kernel_turns.document import TimedVariant
 from kernel_turns.problems import GPU, Problem, by_token, input_scales, plain, problem, relative
 from kernel_turns.variants import Variant
 from turbopi.backends import resolve_device
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.sm90.denoise.kernel import MARKS, unavailable
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert
+from turbopi.support.errors import BackendUnavailable
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
 

@@ -30,9 +30,9 @@ from load_test.document import COLUMNS, LoadDocument, read_load, tables
 from load_test.observations import picture_size
 from load_test.run import Wanted, run
 from turbopi.cli.api_key import chosen_key
-from turbopi.errors import TurboPiError
-from turbopi.files import write_whole
-from turbopi.reading import plain_document
+from turbopi.support.errors import TurboPiError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document
 
 UNANSWERED, BAD_USAGE = 1, 2
 

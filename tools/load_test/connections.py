@@ -28,16 +28,16 @@ def kind_of(text: str) -> str:
 
 
 class TurbopiConnection:
-    """`turbopi.client.RealTimeClient`, which a robot would use."""
+    """`turbopi.realtime.client.RealTimeClient`, which a robot would use."""
 
     def __init__(self, url: str, api_key: str | None, answer_s: float) -> None:
-        from turbopi.client import RealTimeClient
+        from turbopi.realtime.client import RealTimeClient
 
         self._client = RealTimeClient(url, api_key=api_key, answer_s=answer_s)
 
     def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        from turbopi.client import ServerLost, ServerRefused
-        from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
+        from turbopi.realtime.client import ServerLost, ServerRefused
+        from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError
 
         try:
             return self._client.infer(observation)
@@ -113,7 +113,7 @@ class BareConnection:
         self._frame()  # the metadata
 
     def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        from turbopi.wire import unpack
+        from turbopi.realtime.wire import unpack
 
         if id(observation) not in self._frames:
             self._frames[id(observation)] = _masked_frame(observation)
@@ -160,7 +160,7 @@ def _masked_frame(observation: Mapping[str, Any]) -> bytes:
     """A binary message with an observation, as a client sends it (RFC 6455, 5.2)."""
     from websockets.frames import apply_mask
 
-    from turbopi.wire import pack
+    from turbopi.realtime.wire import pack
 
     payload, mask = pack(dict(observation)), os.urandom(4)
     return b"\x82\xff" + len(payload).to_bytes(8, "big") + mask + apply_mask(payload, mask)
@@ -177,9 +177,9 @@ def connect(kind: Kind, url: str, api_key: str | None, answer_s: float) -> Conne
 
 
 def read_observation(kind: Kind, file: Path) -> dict[str, Any]:
-    """An observation as `turbopi.wire.pack` wrote it, by what the client has to read it: openpi's needs no Turbo-Pi."""
+    """An observation as `wire.pack` wrote it, by what the client has to read it: openpi's needs no Turbo-Pi."""
     if kind != "openpi":
-        from turbopi.wire import unpack
+        from turbopi.realtime.wire import unpack
 
         return dict(unpack(file.read_bytes()))
     import importlib

@@ -9,9 +9,9 @@ from msgspec import Meta, Struct
 from rich.table import Table
 
 from load_test.schedule import Arrivals, Request
-from turbopi.errors import ConfigError
-from turbopi.provenance import Provenance
-from turbopi.reading import read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import read_document
 
 COLUMNS = 80  # that the table fits into
 MAX_BYTES = 16 * 2**20
@@ -42,7 +42,7 @@ class Spread(Struct, frozen=True):
 class Load(Struct, frozen=True, kw_only=True):
     """What was asked for.
 
-    client      "turbopi": turbopi.client.RealTimeClient; "openpi": openpi-client; "bare": sends prepared bytes
+    client      "turbopi": turbopi.realtime.client.RealTimeClient; "openpi": openpi-client; "bare": sends prepared bytes
     rate        requests a second of all clients together; None in a closed loop
     seconds     that were measured, after `warmup_seconds` that weren't
     robot       whose observations were sent, or the file of one

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ConfigError
 from turbopi.recordings import load_observation
 from turbopi.robots import create_robot
+from turbopi.support.errors import ConfigError
 
 OF_A_CLIENT = 4  # in turns, so that no picture is the one before: a backend may not copy that again
 

@@ -18,10 +18,10 @@ from load_test.connections import Kind
 from load_test.document import Clients, Load, LoadDocument, ProcessUse, summary
 from load_test.observations import observations, shapes
 from load_test.schedule import Arrivals, Request
-from turbopi.client import RealTimeClient
-from turbopi.errors import ConfigError
-from turbopi.provenance import provenance
-from turbopi.wire import pack
+from turbopi.realtime.client import RealTimeClient
+from turbopi.realtime.wire import pack
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import provenance
 
 HERE = Path(__file__).resolve().parents[2]
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")

@@ -22,7 +22,7 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.batch_runner import Asked, BegunBatch, Call, Finish
 from turbopi.engine.packing import pack_rows, split
-from turbopi.model.conditioning import Form
+from turbopi.models.pi0.conditioning import Form
 
 # Milliseconds of vision, prefix and denoising of a call for so many observations of two pictures, and what `fused`
 # splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.

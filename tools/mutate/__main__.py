@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mutate.faults import FAULTS, Fault, place
-from turbopi.files import write_whole
+from turbopi.support.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/dev/faults.md"

@@ -185,7 +185,7 @@ FAULTS = (
     ),
     Fault(
         "RoPE's sign in the reference",
-        "turbopi.model",
+        "turbopi.models.pi0",
         "x1 * cos - x2 * sin, x2 * cos + x1 * sin",
         "x1 * cos + x2 * sin, x2 * cos - x1 * sin",
         "positions count backwards",
@@ -201,7 +201,7 @@ FAULTS = (
     ),
     Fault(
         "an Euler step in the wrong direction",
-        "turbopi.model",
+        "turbopi.models.pi0",
         "return x_t + step_size(num_steps) * v_t",
         "return x_t - step_size(num_steps) * v_t",
         "denoising adds noise",

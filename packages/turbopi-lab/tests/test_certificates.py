@@ -11,8 +11,8 @@ from msgspec import Struct
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.errors import ConfigError
-from turbopi.reading import as_document, plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import as_document, plain_document, read_document
 from turbopi.verify.document import Certificate, Determinism
 from turbopi_lab.studies import certificates
 from turbopi_lab.studies.actions import BackendOff

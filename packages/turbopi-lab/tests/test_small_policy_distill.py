@@ -9,9 +9,9 @@ import torch
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import open_checkpoint
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model, Trace
-from turbopi.shipped import CHASE_POLICY
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model, Trace
+from turbopi.policy.shipped import CHASE_POLICY
 from turbopi_lab.small_policy import distill
 from turbopi_lab.small_policy.distill import Settings, Student, Ways, teach
 from turbopi_lab.small_policy.forward import suffix_velocity

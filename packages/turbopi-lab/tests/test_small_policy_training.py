@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.pytorch import reference_model
-from turbopi.model import denoise
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
-from turbopi.shipped import SMALL_POLICY
+from turbopi.models.observation import Observation
+from turbopi.models.pi0 import denoise
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.sim import SimulatorUnavailable, create
 from turbopi.sim.chase import Chase
 from turbopi_lab.small_policy import chase

@@ -14,15 +14,15 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from turbopi import UnifiedPolicy
-from turbopi.arguments import Denoising
-from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import Paired, Rate
-from turbopi.model.conditioning import Conditioning
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.policy.call_options import Denoising
+from turbopi.policy.shipped import CHASE_POLICY
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import Site
-from turbopi.reading import read_document
-from turbopi.shipped import CHASE_POLICY
 from turbopi.sim.chase import SPEED as CHASE_SPEED
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document
 from turbopi_lab.command import command
 from turbopi_lab.studies import (
     STUDIES,

@@ -13,14 +13,14 @@ from cli_helpers import refusal, turbopi
 from turbopi import UnifiedPolicy
 from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import open_checkpoint
-from turbopi.errors import ConfigError
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
 from turbopi.evaluate.statistics import Paired, Rate
-from turbopi.observation import Observation
-from turbopi.reading import read_document
-from turbopi.shipped import CHASE_POLICY
+from turbopi.models.observation import Observation
+from turbopi.policy.shipped import CHASE_POLICY
 from turbopi.sim import Task
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document
 from turbopi_lab.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi_lab.studies.kv_reuse import Reuse, Reusing
 from turbopi_lab.studies.report import Report

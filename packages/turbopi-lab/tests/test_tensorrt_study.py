@@ -15,8 +15,8 @@ from tensorrt_fakes import Twin
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.observation import Observation
-from turbopi.reading import plain_document, read_document
+from turbopi.models.observation import Observation
+from turbopi.support.reading import plain_document, read_document
 from turbopi_lab.studies.actions import actions_study
 from turbopi_lab.studies.mask import mask_study
 from turbopi_lab.studies.precision import attention_study
@@ -110,6 +110,6 @@ def test_the_command_refuses_what_it_cant_study(monkeypatch: pytest.MonkeyPatch)
     assert "unknown study 'speed'; choose of steps, " in refusal(turbopi("study", "speed"))
     assert "no weights: give a checkpoint's folder" in refusal(turbopi("study", "mask"))
     assert "--policy is 'two_ways'; expected NAME=FOLDER" in refusal(turbopi("study", "steps", "--policy", "two_ways"))
-    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("turbopi.backends.tensorrt.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("study", "precision", "--random-weights", "pi05_tiny", "--device", "cpu"))
     assert "the precision study needs TensorRT: neither tensorrt_rtx nor tensorrt is installed" in said

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi import extensions
 from turbopi.backends.base import (
     Backend,
     Begins,
@@ -26,9 +25,10 @@ from turbopi.backends.base import (
 )
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
-from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS, format_of
+from turbopi.support import extensions
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 __all__ = [
     "BACKENDS",
@@ -100,25 +100,25 @@ _SPECS = (
     ),
     BackendSpec(
         "onnx",
-        "turbopi.backends.onnx",
+        "turbopi.backends.onnx.backend",
         "OnnxBackend",
         "the exported ONNX graphs in ONNX Runtime, f32: CPUs",
     ),
     BackendSpec(
         "tensorrt",
-        "turbopi.backends.tensorrt",
+        "turbopi.backends.tensorrt.backend",
         "TensorRTBackend",
         "TensorRT engines for vision, prefix MLPs and denoising: NVIDIA GPUs from compute capability 8.0",
     ),
     BackendSpec(
         "tensorrt_fp8",
-        "turbopi.backends.tensorrt_fp8",
+        "turbopi.backends.tensorrt.fp8",
         "TensorRTFp8Backend",
         "tensorrt with calibrated E4M3 MLPs in the prefix: NVIDIA GPUs from compute capability 8.9",
     ),
     BackendSpec(
         "tensorrt_pipelined",
-        "turbopi.backends.tensorrt_pipelined",
+        "turbopi.backends.tensorrt.pipelined",
         "TensorRTPipelinedBackend",
         "tensorrt with two observations in flight: throughput, not latency",
     ),

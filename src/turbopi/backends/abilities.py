@@ -1,7 +1,7 @@
 """Which protocols a backend has, found out once: `isinstance` of one takes 10 us, which every call would pay."""
 
 from turbopi.backends.base import Backend, Begins, Conditions, RunsBatches
-from turbopi.model.conditioning import Form
+from turbopi.models.pi0.conditioning import Form
 
 
 class Abilities:

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from turbopi.checkpoint.base import Room
 from turbopi.config import ImageResize, ModelConfig
-from turbopi.model.conditioning import Conditioning, Conditionings, Form
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import FloatPrecision, Trace
-from turbopi.model.sample import Sample
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import FloatPrecision, Trace
+from turbopi.models.pi0.sample import Sample
 from turbopi.quantization.plan import Precision
 
 # Loads the checkpoint's tensors, by canonical name, to a device or a room (`Checkpoint.load`) in a precision.
@@ -42,7 +42,7 @@ class Begun(Protocol):
 
 
 class Backend(Protocol):
-    """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
+    """A way to run the model. All of them compute what `turbopi.models.pi0.reference.Pi0Model` computes.
 
     Observations and noise may be on the host or on the device; both are moved where they are needed. What only some
     can do besides are `Begins`, `RunsBatches`, `Submits`, `Conditions` and `RunsFp8`.

@@ -17,12 +17,12 @@ from turbopi.engine import without_compiler
 from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
-from turbopi.engine.recent_loops import Loop
-from turbopi.engine.room import PackingRoom, is_conditioning
+from turbopi.engine.graph_cache import Loop
+from turbopi.engine.weight_placement import PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
-from turbopi.toolchain import make_caches_writable
+from turbopi.support.errors import BackendError
+from turbopi.support.toolchain import make_caches_writable
 
 
 class CudaGraphBackend(BatchRunner):

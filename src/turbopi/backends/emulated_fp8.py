@@ -15,8 +15,8 @@ from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.emulate import Round, input_rounding, put_into_norm, round_weight
-from turbopi.model.conditioning import Form
-from turbopi.model.sites import linears, norm_of
+from turbopi.models.pi0.conditioning import Form
+from turbopi.models.pi0.sites import linears, norm_of
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites

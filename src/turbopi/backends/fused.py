@@ -17,15 +17,14 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.cuda_graph import CudaGraphBackend
-from turbopi.backends.lost import ADVICE
+from turbopi.backends.device_lost import ADVICE
 from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent_loops import Loop
-from turbopi.engine.room import HOST, PackingRoom, is_conditioning
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
+from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
@@ -34,7 +33,8 @@ from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import KINDS
-from turbopi.toolchain import missing_for_c
+from turbopi.support.errors import BackendUnavailable, DeviceLost
+from turbopi.support.toolchain import missing_for_c
 
 logger = logging.getLogger(__name__)
 

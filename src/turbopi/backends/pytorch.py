@@ -8,11 +8,11 @@ from torch import Tensor
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError
-from turbopi.model.conditioning import Conditioning, Conditionings, Form
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, Trace
+from turbopi.support.errors import BackendError
 
 
 class PyTorchBackend:

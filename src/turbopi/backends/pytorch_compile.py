@@ -16,12 +16,12 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
-from turbopi.engine.not_warm import not_warm
-from turbopi.errors import BackendError, BackendUnavailable, ObservationError
-from turbopi.model.conditioning import Conditioning, Conditionings, Form
-from turbopi.model.reference import FloatPrecision, Pi0Model
-from turbopi.observation import Observation
-from turbopi.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
+from turbopi.engine.cold_call import not_warm
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
+from turbopi.support.errors import BackendError, BackendUnavailable, ObservationError
+from turbopi.support.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
 
 # Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
 # 256, beyond which it runs the stage without compiling it

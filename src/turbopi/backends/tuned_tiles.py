@@ -19,12 +19,12 @@ from typing import Annotated, Final
 import torch
 from msgspec import Meta, Struct
 
-from turbopi.errors import ConfigError
-from turbopi.files import cache_folder, make_folder, write_whole
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Kernels, Knobs, Numbers, TileKey, TileTable
-from turbopi.provenance import driver_version
-from turbopi.reading import plain_document, read_document
-from turbopi.source_code import code_of
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import cache_folder, make_folder, write_whole
+from turbopi.support.provenance import driver_version
+from turbopi.support.reading import plain_document, read_document
+from turbopi.support.source_code import code_of
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import PRECISIONS, PredictedCall, predict, refused
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 
 class BatchTable(Struct, frozen=True, kw_only=True):

@@ -12,9 +12,9 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from turbopi.bench.machine_limits import Floors
 from turbopi.bench.work import Job, Work
-from turbopi.errors import ConfigError
-from turbopi.provenance import Gpu, Provenance
-from turbopi.reading import as_document, read_json
+from turbopi.support.errors import ConfigError
+from turbopi.support.provenance import Gpu, Provenance
+from turbopi.support.reading import as_document, read_json
 
 MAX_BYTES = 64 * 2**20  # a table of six backends: about 1 MB
 Milliseconds = Annotated[float, Meta(ge=0)]

@@ -12,9 +12,9 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from turbopi.errors import ConfigError
-from turbopi.reading import read_document, shown
-from turbopi.wording import names_known
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document, shown
+from turbopi.support.text import names_known
 
 FILE = Path(__file__).parents[1] / "data" / "gpus.json"
 _Positive = Annotated[float, Meta(gt=0)]

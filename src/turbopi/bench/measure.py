@@ -15,13 +15,13 @@ from turbopi.bench.document import PolicyError, Times
 from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization, Solver, TimeGrid
-from turbopi.errors import ConfigError
-from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.quantization.plan import TIERS
 from turbopi.robots import Plain, Robot
+from turbopi.support.errors import ConfigError
 
 _WORDS = "pick up the red black white bowl mug plate and place put it on in left right drawer stove open a to of"
 WORDS = _WORDS.split()

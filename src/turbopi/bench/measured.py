@@ -11,8 +11,8 @@ from msgspec import Struct
 
 from turbopi.bench.document import Times
 from turbopi.bench.work import Job
-from turbopi.errors import ConfigError
-from turbopi.reading import read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import read_document
 
 FILE = Path(__file__).parents[1] / "data" / "measured_calls.json"
 Kernels = Literal["hopper", "portable", "pytorch"]

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from turbopi.bench.document import BenchDocument, Line, Result, Times, all_steps, label
 from turbopi.bench.summary import below_floor
-from turbopi.plots import BOUND, STAGES, as_text, write_figure
-from turbopi.reading import as_document, plain_document
+from turbopi.support.plots import BOUND, STAGES, as_text, write_figure
+from turbopi.support.reading import as_document, plain_document
 
 DRAWN_OF = "Drawn of"  # the PNG text in which a plot names its document
 

@@ -9,7 +9,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from turbopi.bench.document import Kernel, StageKernels
 from turbopi.bench.measure import WARMING, Observations
 from turbopi.bench.work import Job
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy.policy import UnifiedPolicy
 
 STAGES = ("vision", "prefix", "denoise")
 _CALL = "turbopi call"

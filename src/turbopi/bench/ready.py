@@ -19,8 +19,8 @@ import msgspec
 from msgspec import Struct
 
 from turbopi.bench.document import Ready, ReadyTimes
-from turbopi.errors import BackendError
 from turbopi.quantization.plan import TIERS
+from turbopi.support.errors import BackendError
 
 _TIMEOUT = 900  # seconds
 
@@ -97,7 +97,7 @@ def _main(start: Start) -> None:
     import torch
 
     from turbopi.checkpoint import open_checkpoint, random_checkpoint
-    from turbopi.policy import UnifiedPolicy
+    from turbopi.policy.policy import UnifiedPolicy
     from turbopi.robots import import_robot
 
     if start.preset is None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, label
 from turbopi.bench.machine_limits import Floors
-from turbopi.wording import significant
+from turbopi.support.text import significant
 
 _STAGES = ("vision", "prefix", "denoise")
 PERCENTILES: tuple[Percentile, ...] = ("p5", "p95", "p99")

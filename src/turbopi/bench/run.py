@@ -29,11 +29,11 @@ from turbopi.bench.work import MODEL_SIZE, Job, Join, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import Solver, TimeGrid
 from turbopi.engine.graph import collect_and_empty_cache
-from turbopi.errors import ConfigError, TurboPiError
-from turbopi.policy import UnifiedPolicy
-from turbopi.provenance import Gpu, provenance
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.plan import TIERS
 from turbopi.robots import Robot
+from turbopi.support.errors import ConfigError, TurboPiError
+from turbopi.support.provenance import Gpu, provenance
 
 Answered = dict[tuple[str, str, Job], np.ndarray]  # backend, precision and job -> the policy's `answers`
 

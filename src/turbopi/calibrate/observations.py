@@ -7,14 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi import shipped
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.examples import Example, NoisyExample, prepared
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.observation import Observation
+from turbopi.policy import shipped
+from turbopi.policy.examples import Example, NoisyExample, prepared
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import RANDOM_NOISE
 from turbopi.recordings import load_observation
 from turbopi.recordings.sources import chosen_files, spread
+from turbopi.support.errors import ConfigError, ObservationError
 
 LIBERO = "the LIBERO pictures that come with Turbo-Pi"
 EVERY = 4  # of so many observations one is held out

@@ -7,10 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.engine.emulate import Round, RoundedWeights, input_rounding, replaced, through_norm
-from turbopi.model.layers import AdaRMSNorm
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears, norm_of
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.layers import AdaRMSNorm
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears, norm_of
 from turbopi.quantization.sites import Site
 
 

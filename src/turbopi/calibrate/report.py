@@ -5,9 +5,9 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, field
 
-from turbopi.errors import CalibrationError
 from turbopi.quantization.formats import Numbers
-from turbopi.reading import as_document
+from turbopi.support.errors import CalibrationError
+from turbopi.support.reading import as_document
 
 Count = Annotated[int, Meta(ge=0)]
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi import backends, shipped
+from turbopi import backends
 from turbopi.backends.pytorch import reference_model
 from turbopi.calibrate import observations as observed
 from turbopi.calibrate.observations import Batch
@@ -25,17 +25,18 @@ from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.emulate import NO_SIGNAL, RoundedWeights, delta_cosine, has_signal, relative_rms, rounded
 from turbopi.engine.graph import collect_and_empty_cache
-from turbopi.errors import CheckpointError
-from turbopi.examples import NoisyExample, with_noises
-from turbopi.model.reference import Pi0Model, parameter_dtype
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
+from turbopi.policy import shipped
+from turbopi.policy.examples import NoisyExample, with_noises
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.plan import refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
-from turbopi.reading import plain_document
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import plain_document
 
 TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
 ROOM = 0.8  # of the error that the target allows, on the few calls that sites are chosen on: others may be harder

@@ -12,14 +12,14 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from turbopi.errors import ObservationError
-from turbopi.model.layers import AdaRMSNorm
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears, norm_of
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.layers import AdaRMSNorm
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears, norm_of
 from turbopi.quantization.directions import Rows
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.sites import Site
+from turbopi.support.errors import ObservationError
 
 BINS = 0x7F80  # the bins above hold infinities and NaN
 HEADROOM = 2.0  # of what was seen; costs a floating-point format only some of its smallest numbers

@@ -1,7 +1,7 @@
 """Checkpoints of openpi (PyTorch and JAX) and LeRobot, ONNX exports and random weights, behind one interface.
 
     checkpoint = open_checkpoint("path/to/checkpoint", config="pi05_libero")
-    state = checkpoint.load("cuda", "bf16").state  # canonical names, see model/reference.py
+    state = checkpoint.load("cuda", "bf16").state  # canonical names, see models/pi0/reference.py
 
 Every tensor must have its place and every place its tensor: nothing is skipped in silence, and nothing made up.
 """

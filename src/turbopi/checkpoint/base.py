@@ -19,8 +19,8 @@ from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
 from turbopi.config import PolicyConfig
-from turbopi.errors import CheckpointError
-from turbopi.model.reference import FloatPrecision, parameter_dtype
+from turbopi.models.pi0.reference import FloatPrecision, parameter_dtype
+from turbopi.support.errors import CheckpointError
 
 PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
 

@@ -11,8 +11,8 @@ from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read
 from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import WeightSource, listing
 from turbopi.config import GemmaConfig, PolicyConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import read_json, shown
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import read_json, shown
 
 CONFIG = "config.json"
 _DTYPES = {"bfloat16": "BF16", "bf16": "BF16", "float32": "F32", "fp32": "F32", "float16": "F16", "fp16": "F16"}

@@ -5,10 +5,10 @@ from collections import Counter
 from pathlib import Path
 
 from turbopi.checkpoint.base import Checkpoint
-from turbopi.errors import ConfigError
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.formats import Numbers
 from turbopi.quantization.plan import TIERS, format_of
+from turbopi.support.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 

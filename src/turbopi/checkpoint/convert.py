@@ -33,9 +33,9 @@ from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, RealTime
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.files import new_folder
-from turbopi.model.reference import FloatPrecision
+from turbopi.models.pi0.reference import FloatPrecision
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.files import new_folder
 
 _DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
     "bf16": ("BF16", torch.bfloat16),

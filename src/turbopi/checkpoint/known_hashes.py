@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from turbopi.files import cache_folder, keep_in_cache
+from turbopi.support.files import cache_folder, keep_in_cache
 
 _SETTLED_S = 2.0  # a file that was changed since may be changed again within the clock's tick: not remembered
 _VERSION = 1  # of what a fingerprint is made from

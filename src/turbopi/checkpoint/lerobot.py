@@ -30,8 +30,8 @@ from turbopi.checkpoint.lerobot_pipeline import (
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import Fields, file_inside, one_line, read_json, shown
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import Fields, file_inside, one_line, read_json, shown
 
 CONFIG, EMPTY_CAMERA = "config.json", "observation.images.empty_camera_"
 

@@ -12,7 +12,7 @@ August 2026 (7427f31), field by field.
 from collections.abc import Mapping
 
 from turbopi.checkpoint.lerobot_versions import FIRST_KEYS
-from turbopi.reading import shown
+from turbopi.support.reading import shown
 
 # key: (the values that Turbo-Pi computes, what that is)
 NEUTRAL: Mapping[str, tuple[tuple[object, ...], str]] = {

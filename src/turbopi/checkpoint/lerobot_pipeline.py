@@ -36,8 +36,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from turbopi.config import LIMITS, Kind
-from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, file_inside, read_json, shown
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import Fields, file_inside, read_json, shown
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
-from turbopi.checkpoint.nothing_here import INTERRUPTED, PRETRAINED, holds_weights, nothing_here, unfinished_save
+from turbopi.checkpoint.missing_files import INTERRUPTED, PRETRAINED, holds_weights, nothing_here, unfinished_save
 from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
-from turbopi.errors import CheckpointError
-from turbopi.files import openpi_cache
+from turbopi.support.errors import CheckpointError
+from turbopi.support.files import openpi_cache
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
 

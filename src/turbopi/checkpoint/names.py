@@ -1,7 +1,7 @@
 """Parameter names: Turbo-Pi's canonical ones and those of openpi's PyTorch files.
 
-Canonical names (see `model/reference.py`) are openpi's with shorter prefixes. LeRobot's are openpi's behind `model.`,
-other programs' behind what they wrap a model in (`module.`, `_orig_mod.`).
+Canonical names (see `models/pi0/reference.py`) are openpi's with shorter prefixes. LeRobot's are openpi's behind
+`model.`, other programs' behind what they wrap a model in (`module.`, `_orig_mod.`).
 """
 
 from collections.abc import Collection

@@ -11,8 +11,8 @@ import numpy as np
 
 from turbopi.checkpoint.source import listing
 from turbopi.config import Normalization, NormMode
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import files_below, is_finite, read_json, shown
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import files_below, is_finite, read_json, shown
 
 FILE_NAME = "norm_stats.json"
 STATISTICS = ("mean", "std", "q01", "q99", "min", "max")

@@ -1,6 +1,6 @@
 """Reading a folder that `turbopi export onnx` wrote, as a checkpoint whose weights are in graphs.
 
-<graph>.onnx, .onnx.data     the graphs, see turbopi.export.graphs
+<graph>.onnx, .onnx.data     the graphs, see turbopi.backends.onnx.graphs
 turbopi_onnx.json            sizes, inputs and outputs, versions, lengths of the files, the weights' hash
 turbopi.json, assets/, …     what a checkpoint has beside its weights: configuration, statistics, robot, tokenizer
 
@@ -17,9 +17,9 @@ import torch
 
 from turbopi.checkpoint.source import Piece, Shape
 from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.model.reference import parameter_shapes
-from turbopi.reading import Fields, file_inside, is_integer, read_json, shown
+from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import Fields, file_inside, is_integer, read_json, shown
 
 MANIFEST = "turbopi_onnx.json"
 GRAPHS = ("vision", "prompt", "prefix", "denoise_step")

@@ -18,8 +18,8 @@ from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
 from turbopi.config import PolicyConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.model.reference import parameter_shapes
+from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.support.errors import CheckpointError, ConfigError
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:

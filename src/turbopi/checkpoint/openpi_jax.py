@@ -14,8 +14,8 @@ from turbopi.checkpoint.openpi_lora import Adapter, LoraScale, find_adapters, me
 from turbopi.checkpoint.orbax import OrbaxTree
 from turbopi.checkpoint.source import PIECE_BYTES, Piece, Shape, check_zeros, row_ranges
 from turbopi.config import LIMITS
-from turbopi.errors import CheckpointError
-from turbopi.reading import files_below
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import files_below
 
 
 class JaxSource:

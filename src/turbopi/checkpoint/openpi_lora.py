@@ -18,7 +18,7 @@ from math import sqrt
 import torch
 from torch import Tensor
 
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 _OPENPI_RANKS = {"vlm": 16, "expert": 32}  # openpi's gemma_2b_lora and gemma_300m_lora: alpha = rank
 

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from turbopi.checkpoint.source import Shape, listing
-from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, files_below, is_integer, one_line, open_file, parse_json, read_json
-from turbopi.reading.files import HEAD_BYTES, failed_download
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import Fields, files_below, is_integer, one_line, open_file, parse_json, read_json
+from turbopi.support.reading.files import HEAD_BYTES, failed_download
 
 MANIFEST = "manifest.ocdbt"
 _DTYPES = {"float32": "F32", "<f4": "F32", "bfloat16": "BF16", "float16": "F16", "<f2": "F16"}

@@ -28,8 +28,8 @@ from turbopi.checkpoint.names import TIED_HEAD, UNUSED_HEAD, current_name, from_
 from turbopi.checkpoint.source import Piece, listing
 from turbopi.checkpoint.torch_files import ITEMSIZE, Stored, TorchSource, read_header, read_tensor
 from turbopi.checkpoint.torch_files import WEIGHTS as MODEL
-from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, read_json, shown
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import Fields, read_json, shown
 
 CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 _PREFIX = "base_model.model."

@@ -27,8 +27,8 @@ from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
 from turbopi.checkpoint.source import Piece, Shape, row_ranges
 from turbopi.config import PolicyConfig, preset
-from turbopi.errors import ConfigError
-from turbopi.model.reference import parameter_shapes
+from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.support.errors import ConfigError
 
 _ROBOT_DIMS = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14)}  # state, actions; other robots: the model's width
 _BLOCK = {"cpu": 2**14, "cuda": 2**24}  # values made at once: few, so that torch takes one core; enough for a GPU

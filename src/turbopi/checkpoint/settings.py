@@ -46,10 +46,10 @@ from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
 from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
-from turbopi.errors import ConfigError
-from turbopi.model.solvers import GRIDS, SOLVERS, checked_grid
-from turbopi.reading import is_finite, is_integer, read_json, shown
-from turbopi.wording import did_you_mean, names_known
+from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import is_finite, is_integer, read_json, shown
+from turbopi.support.text import did_you_mean, names_known
 
 FILE_NAME = "turbopi.json"
 ABOUT_WEIGHTS = {"lora_alpha", "lora_rslora", "base_model", "weights_sha256", "lerobot_semantics"}  # keys of a .json

@@ -6,8 +6,8 @@ from math import isqrt
 
 from turbopi.checkpoint.source import Shape, WeightSource, listing
 from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import shown
+from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import shown
 
 VARIANTS = {  # openpi's names of sizes
     "gemma_2b": GemmaConfig(width=2048, mlp_dim=16384),

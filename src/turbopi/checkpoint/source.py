@@ -12,8 +12,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from turbopi.errors import CheckpointError
-from turbopi.reading import listing
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import listing
 
 # of stored values: small beside a model that fills a machine, large enough that reads cost little each
 PIECE_BYTES = 8 * 2**20

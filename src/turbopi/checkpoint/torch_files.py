@@ -26,9 +26,9 @@ from turbopi.checkpoint.names import (
     to_openpi,
 )
 from turbopi.checkpoint.source import Piece, Shape, check_zeros, judged_for_zeros, listing, row_ranges
-from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, one_line, open_file, read_json
-from turbopi.reading.files import HEAD_BYTES, failed_download
+from turbopi.support.errors import CheckpointError
+from turbopi.support.reading import Fields, one_line, open_file, read_json
+from turbopi.support.reading.files import HEAD_BYTES, failed_download
 
 ITEMSIZE = {"F32": 4, "BF16": 2, "F16": 2}
 WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"

@@ -7,9 +7,9 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from turbopi import extensions
 from turbopi.cli.framework import Command, Described, app, describe, log_to_stderr, with_errors_told, without_types
-from turbopi.errors import ConfigError
+from turbopi.support import extensions
+from turbopi.support.errors import ConfigError
 
 ELSEWHERE = {  # commands of ours that are installed apart
     "study": "`turbopi study` comes with the package turbopi-lab; in Turbo-Pi's clone: "

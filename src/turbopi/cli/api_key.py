@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from turbopi.errors import ConfigError
 from turbopi.serve.options import key_in
+from turbopi.support.errors import ConfigError
 
 # hidden from --help: `ps` shows a key on the command line to everyone on the machine
 ApiKey = Annotated[str | None, typer.Option("--api-key", envvar="TURBOPI_API_KEY", metavar="KEY", hidden=True)]

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
-from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 
 @command("backends", examples=("turbopi backends", "turbopi backends --device cpu --json"))

@@ -18,9 +18,9 @@ from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_c
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
 from turbopi.config import CAMERAS, LIMITS, ModelConfig, typed_grid
-from turbopi.errors import ConfigError
-from turbopi.files import write_whole
-from turbopi.reading import plain_document, shown
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document, shown
 
 if TYPE_CHECKING:
     import torch
@@ -254,8 +254,8 @@ def bench(
     # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
     with empty_caches() if ready else nullcontext():
         from turbopi import backends as registry
-        from turbopi.arguments import Denoising
         from turbopi.bench.run import BenchPlan, run
+        from turbopi.policy.call_options import Denoising
 
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)

@@ -10,12 +10,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, EngineCalibration, ScaleMethod, WeightOptions
 from turbopi.config import LIMITS
-from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
-    from turbopi.observation import Observation
-    from turbopi.policy import UnifiedPolicy
-    from turbopi.tensorrt.calibrate import Calibration
+    from turbopi.backends.tensorrt.calibrate import Calibration
+    from turbopi.models.observation import Observation
+    from turbopi.policy.policy import UnifiedPolicy
 
 PRECISIONS = ("bf16", "fp8")
 
@@ -74,10 +74,10 @@ def build(
     if precision == "bf16" and calibration is not None:
         raise ConfigError("--calibration is for --precision fp8; bf16 engines need none")
     from turbopi import backends
-    from turbopi.tensorrt import calibrate, library
-    from turbopi.tensorrt.cache import default_folder
-    from turbopi.tensorrt.engines import for_this_gpu
-    from turbopi.tensorrt.parts import SLOTS, EngineShape, fingerprint
+    from turbopi.backends.tensorrt import calibrate, library
+    from turbopi.backends.tensorrt.cache import default_folder
+    from turbopi.backends.tensorrt.engines import for_this_gpu
+    from turbopi.backends.tensorrt.parts import SLOTS, EngineShape, fingerprint
 
     resolved = backends.resolve_device(device)
     backend = "tensorrt_fp8" if precision == "fp8" else "tensorrt"
@@ -88,7 +88,7 @@ def build(
     options.tell_if_random(opened, output)
     from turbopi.backends.pytorch import reference_model
     from turbopi.engine.weights import pack
-    from turbopi.policy import UnifiedPolicy
+    from turbopi.policy.policy import UnifiedPolicy
 
     policy = UnifiedPolicy(opened, backend="pytorch", precision="bf16", device=resolved, progress=output.shows_progress)
     config = policy.config.model
@@ -145,7 +145,7 @@ def build(
 def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, output: Output) -> "Calibration":
     """Scales from observations, or from a file that `turbopi calibrate` wrote."""
     from turbopi.backends.pytorch import reference_model
-    from turbopi.tensorrt.calibrate import calibrate, from_quantization
+    from turbopi.backends.tensorrt.calibrate import calibrate, from_quantization
 
     model = reference_model(policy.backend)
     if path is not None and path.suffix == ".json" and path.is_file():
@@ -162,7 +162,7 @@ def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, outp
 
 def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tuple[list[Observation], str]":
     """Observations as the policy's model sees them, and where they are from."""
-    from turbopi.observation import Observation
+    from turbopi.models.observation import Observation
 
     given, source = given_observations(policy, path)
     return [Observation.stack([policy.prepare(one)]) for one in given], source
@@ -171,7 +171,7 @@ def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tup
 def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, object]], str]:
     """Observations under the robot's keys, and where they are from; None: the pictures that come with Turbo-Pi."""
     if path is None:
-        from turbopi.shipped import load_frames, observations
+        from turbopi.policy.shipped import load_frames, observations
 
         return observations(policy, load_frames()), "LIBERO pictures that come with Turbo-Pi"
     from turbopi.cli.infer import _sources

@@ -11,8 +11,8 @@ from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import MOST_NOISES, MOST_OBSERVATIONS, CheckpointArgument, RobotOptions
 from turbopi.cli.progress import with_stages
 from turbopi.config import LIMITS
-from turbopi.errors import ConfigError
-from turbopi.wording import significant
+from turbopi.support.errors import ConfigError
+from turbopi.support.text import significant
 
 if TYPE_CHECKING:
     from turbopi.calibrate.report import ActionsError
@@ -134,8 +134,8 @@ def _replaced(out: Path) -> str | None:
     """What the calibration that stands at `out` was made on; None if nothing stands there. ConfigError for anything
     else: it would be lost.
     """
-    from turbopi.errors import CalibrationError
     from turbopi.quantization.calibration_file import Quantization
+    from turbopi.support.errors import CalibrationError
 
     if not out.exists():
         return None

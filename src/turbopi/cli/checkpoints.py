@@ -14,9 +14,9 @@ from rich.table import Table
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
-from turbopi.errors import ConfigError
-from turbopi.files import write_whole
-from turbopi.wording import data_size, denoising
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.text import data_size, denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint

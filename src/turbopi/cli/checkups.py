@@ -16,9 +16,9 @@ from turbopi.cli.checkup import FULL_SIZE_GB, Level, Row, has_gpu, imported_torc
 from turbopi.cli.gpu_checkups import check_gpu, check_triton
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.typed import as_typed
-from turbopi.errors import TurboPiError
-from turbopi.installation import install_command
-from turbopi.toolchain import missing_for_c, missing_for_cpp
+from turbopi.support.errors import TurboPiError
+from turbopi.support.installation import install_command
+from turbopi.support.toolchain import missing_for_c, missing_for_cpp
 
 MIN_PYTHON, MIN_TORCH = (3, 10), "2.8"
 MIN_DISK_GB = 15.0

@@ -12,7 +12,7 @@ from rich.table import Table
 from turbopi.cli.evaluate import EvalOptions, run_with_progress
 from turbopi.cli.files import check_report
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -157,8 +157,8 @@ def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
 def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint: "Checkpoint") -> None:
     """Refuse what can't run before hours of what can."""
     from turbopi import backends
-    from turbopi.arguments import checked_steps
     from turbopi.checkpoint.calibration import calibration_of
+    from turbopi.policy.call_options import checked_steps
     from turbopi.quantization.plan import TIERS
 
     device = backends.resolve_device(options.device)

@@ -12,15 +12,15 @@ from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import STAGES, timing_columns
-from turbopi.errors import ConfigError
-from turbopi.files import write_whole
-from turbopi.wording import significant
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.text import significant
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from turbopi.demo import OracleCheck
-    from turbopi.shipped import Frame
+    from turbopi.policy.shipped import Frame
+    from turbopi.verify.demo import OracleCheck
 
 
 @command(
@@ -88,7 +88,7 @@ def demo(
     if episodes is not None and episodes > 20:
         raise ConfigError(f"--episodes is {episodes}; LIBERO's part of the demo plays 20 at most (turbopi eval libero)")
     if checkpoint is None and options.random_weights is None:
-        from turbopi.shipped import SMALL_POLICY
+        from turbopi.policy.shipped import SMALL_POLICY
 
         checkpoint = str(SMALL_POLICY)
     # what can't be written, or played, is better known before the work
@@ -112,9 +112,9 @@ class _Run:
         self, options: PolicyOptions, checkpoint: str | None, limit: int | None, seed: int, output: Output
     ) -> None:
         opened = options.open(checkpoint)
-        from turbopi.demo import check, num_oracle_runs, run_frames
-        from turbopi.policy import UnifiedPolicy
-        from turbopi.shipped import load_frames, observations, with_libero_stats
+        from turbopi.policy.policy import UnifiedPolicy
+        from turbopi.policy.shipped import load_frames, observations, with_libero_stats
+        from turbopi.verify.demo import check, num_oracle_runs, run_frames
 
         self.output, self.seed = output, seed
         self.frames: list[Frame] = load_frames()[:limit]
@@ -162,7 +162,7 @@ class _Run:
 
     def _show_expert(self) -> None:
         """How near the chunks are to the expert's, for a policy that should be."""
-        from turbopi.demo import expert_distance
+        from turbopi.verify.demo import expert_distance
 
         if self.robot != "libero" or self.metadata["random_weights"]:
             return
@@ -189,7 +189,7 @@ class _Run:
         self.output.line(STAGES, "dim")
 
     def _show_chunk(self, actions: "np.ndarray") -> None:
-        from turbopi.showing import action_groups
+        from turbopi.support.action_groups import action_groups
 
         steps, dims = actions.shape
         shown = min(steps, 10, max(3, (self.output.console.width - 42) // 9))
@@ -269,7 +269,7 @@ class _Run:
         }
 
     def _plot(self, file: Path) -> None:
-        from turbopi.plots import Row, plot_chunks
+        from turbopi.support.plots import Row, plot_chunks
 
         rows = [
             Row(

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turbopi.cli.framework import Output
-from turbopi.reading import plain_document
+from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.evaluate.results import Episode, Results
-    from turbopi.policy import UnifiedPolicy
+    from turbopi.policy.policy import UnifiedPolicy
 
 SUITE = "libero_spatial"
 TASKS = tuple(range(10))  # in the order in which they are taken

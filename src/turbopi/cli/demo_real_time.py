@@ -9,8 +9,8 @@ from rich.progress import Progress
 from turbopi.cli.files import check_report
 from turbopi.cli.framework import Output, new_console, plain
 from turbopi.cli.options import PolicyOptions
-from turbopi.files import write_whole
-from turbopi.reading import plain_document
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.evaluate.statistics import Paired
@@ -24,7 +24,7 @@ def show_real_time(
     """Play, tell and plot. The numbers are counted here, and the sentences follow from them."""
     check_report(report / "real_time.json", "ways", "a report of `turbopi demo --real-time`")
     if checkpoint is None and options.random_weights is None:
-        from turbopi.shipped import CHASE_POLICY
+        from turbopi.policy.shipped import CHASE_POLICY
 
         checkpoint = str(CHASE_POLICY)
     from turbopi.evaluate.real_time_demo import (

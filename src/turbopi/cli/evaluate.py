@@ -12,13 +12,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
+from turbopi.cli.capabilities import offers_of
 from turbopi.cli.evaluate_options import EvalOptions
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
-from turbopi.cli.offers import offers_of
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
-from turbopi.errors import ConfigError
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -218,7 +218,7 @@ def run_with_progress(
     from turbopi.evaluate.pacing import rate_told
     from turbopi.evaluate.run import default_workers, evaluate, most_at_once, pending, prepare
     from turbopi.evaluate.visited import Recording
-    from turbopi.execution import way_named
+    from turbopi.realtime import way_named
 
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
     if answer.problem is None:

@@ -9,7 +9,7 @@ import typer
 from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -254,7 +254,7 @@ class EvalOptions(PolicyOptions):
     ) -> "PolicySource":
         """The policy in this process, warmed up. `check` is called before its weights are loaded."""
         from turbopi.evaluate.sources import LocalPolicy
-        from turbopi.shipped import with_libero_stats
+        from turbopi.policy.shipped import with_libero_stats
 
         opened = with_libero_stats(self.open(checkpoint))
         check(opened)

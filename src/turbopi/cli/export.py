@@ -9,8 +9,8 @@ import typer
 from turbopi.cli.checkpoints import complete_random
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import EngineCalibration, ScaleMethod, WeightOptions
-from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.wording import data_size
+from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.text import data_size
 
 FORMATS = ("onnx",)
 PRECISIONS = ("f32", "fp8")
@@ -68,11 +68,11 @@ def export(
     import torch
 
     from turbopi.backends import resolve_device
-    from turbopi.export.onnx import EXPORT_NEEDS, check_target, export_onnx, missing_library
-    from turbopi.model.reference import Pi0Model
+    from turbopi.backends.onnx.export import EXPORT_NEEDS, check_target, export_onnx, missing_library
+    from turbopi.models.pi0.reference import Pi0Model
 
     check_target(Path(target).expanduser())  # before minutes of loading
-    from turbopi.tensorrt.calibrate import unavailable
+    from turbopi.backends.tensorrt.calibrate import unavailable
 
     missing = missing_library(EXPORT_NEEDS) or (unavailable(method) if precision == "fp8" else None)
     if missing is not None:
@@ -83,7 +83,7 @@ def export(
     found = None
     if precision == "fp8":
         from turbopi.cli.build import measure_scales
-        from turbopi.policy import UnifiedPolicy
+        from turbopi.policy.policy import UnifiedPolicy
 
         policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu")
         found = measure_scales(policy, calibration, method, output)

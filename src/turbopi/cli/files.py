@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.support.errors import ConfigError, ObservationError
 
 MAX_RESULTS_BYTES = 512 * 2**20
 
@@ -59,7 +59,7 @@ def check_replaces(file: Path, key: str, what: str) -> None:
     """Raise ConfigError if a file is there that isn't `what` a command writes, a JSON object with this key: another
     command's results would be lost.
     """
-    from turbopi.reading import read_json
+    from turbopi.support.reading import read_json
 
     if file.exists() and key not in read_json(file, ConfigError, limit=MAX_RESULTS_BYTES):
         raise ConfigError(f"{file} is there and isn't {what}, so it isn't replaced; name another folder")
@@ -85,7 +85,7 @@ MAX_NOISE_BYTES = 16 * 2**20  # of float64[1000, 1024], twice
 
 def load_noise(file: Path) -> "np.ndarray":
     """The noise in an .npy file, or under `noise` in an .npz. Raises ObservationError if there is none."""
-    from turbopi.reading import Npz, listing, open_file, read_npy
+    from turbopi.support.reading import Npz, listing, open_file, read_npy
 
     try:
         with open_file(file, ObservationError) as stream:

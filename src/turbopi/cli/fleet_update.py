@@ -9,14 +9,14 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from turbopi.cli.offers import check_warmup
+from turbopi.cli.capabilities import check_warmup
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import ConfigError
 from turbopi.serve.options import ServerOptions
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
-    from turbopi.serve.fleet import FleetOptions
+    from turbopi.serve.fleet.fleet import FleetOptions
 
 OF_WEIGHTS = ("random_weights", "weights_seed", "quantization", "fp8_parts")  # not of those that come
 OF_LINE = ("queue_limit", "max_batch", "execution", "control_hz")  # of the server's options: `fleet.line_of`
@@ -91,8 +91,8 @@ def scaled_as(options: "FleetOptions", running: Mapping[str, Any], given: Collec
 
 def runs(policy: PolicyOptions, opened: "Checkpoint") -> dict[str, Any]:
     """Of the metadata that a policy will have, what may come from its checkpoint. Raises ConfigError."""
-    from turbopi.arguments import Denoising
     from turbopi.config import typed_grid
+    from turbopi.policy.call_options import Denoising
 
     fitting = policy.for_checkpoint(opened)
     asked: Any = (fitting.steps, fitting.solver, typed_grid(fitting.time_grid))

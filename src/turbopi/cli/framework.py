@@ -40,8 +40,8 @@ from turbopi.cli.process import (
 )
 from turbopi.cli.tables import fitted
 from turbopi.cli.typed import as_typed
-from turbopi.errors import ConfigError, DeviceLost, TurboPiError
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError, DeviceLost, TurboPiError
+from turbopi.support.reading import plain_document
 
 CHECK_FAILED, OUR_FAULT = 1, 3
 MAX_MESSAGE = 2000  # characters of an error

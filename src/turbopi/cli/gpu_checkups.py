@@ -17,8 +17,8 @@ from packaging.version import Version
 
 from turbopi.cli.checkup import FULL_SIZE_GB, Row, has_gpu, imported_torch
 from turbopi.cli.typed import as_typed
-from turbopi.errors import TurboPiError
-from turbopi.toolchain import PTXAS_BLACKWELL_VARIABLE, PTXAS_VARIABLE, cuda_13_ptxas
+from turbopi.support.errors import TurboPiError
+from turbopi.support.toolchain import PTXAS_BLACKWELL_VARIABLE, PTXAS_VARIABLE, cuda_13_ptxas
 
 MIN_CAPABILITY = (8, 0)  # the first with bfloat16 tensor cores
 MIN_DRIVER = {11: 450, 12: 525, 13: 580}  # by CUDA's major version: NVIDIA's CUDA compatibility guide

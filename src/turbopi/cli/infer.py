@@ -16,14 +16,14 @@ from turbopi.cli.files import check_writable, load_noise
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new_console
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.timings import STAGES, timing_columns
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.files import write_whole
+from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.files import write_whole
 
 if TYPE_CHECKING:
     import numpy as np
 
     from turbopi.config import ModelConfig
-    from turbopi.policy import UnifiedPolicy
+    from turbopi.policy.policy import UnifiedPolicy
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 MAX_ROWS = 8  # of a plot; a recording's other calls are in the .npz
@@ -92,7 +92,7 @@ def infer(
         raise ConfigError("--plot and --no-plot were both given; give one of them")
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
-    from turbopi.arguments import checked_noise
+    from turbopi.policy.call_options import checked_noise
     from turbopi.preprocess.robot_checks import note_on_state
     from turbopi.recordings import load_observation
 
@@ -262,8 +262,8 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
 
 
 def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:
-    from turbopi.plots import Row, plot_chunks
-    from turbopi.showing import pictures_of
+    from turbopi.support.action_groups import pictures_of
+    from turbopi.support.plots import Row, plot_chunks
 
     rows = [
         Row(_prompt(answer.observation, about), pictures_of(answer.observation), answer.actions)

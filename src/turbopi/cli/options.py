@@ -12,12 +12,12 @@ from turbopi.cli.framework import Output
 from turbopi.cli.process import interrupts_end_at_once
 from turbopi.cli.typed import as_typed
 from turbopi.config import PRESETS, typed_grid
-from turbopi.errors import ConfigError
-from turbopi.wording import denoising
+from turbopi.support.errors import ConfigError
+from turbopi.support.text import denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
-    from turbopi.policy import UnifiedPolicy
+    from turbopi.policy.policy import UnifiedPolicy
 
 MOST_CALLS, MOST_OBSERVATIONS, MOST_NOISES = 1_000_000, 100_000, 1000  # more is a slip, and would never end
 SHOW_LOADING_BYTES = 1e9  # smaller weights load before a line about it is read
@@ -275,7 +275,7 @@ class PolicyOptions(RobotOptions):
     def make_policy(self, checkpoint: "Checkpoint", output: Output, *, strict: bool = False) -> "UnifiedPolicy":
         """The policy, with what it is printed. `strict` as UnifiedPolicy's."""
         with interrupts_end_at_once():
-            from turbopi.policy import UnifiedPolicy
+            from turbopi.policy.policy import UnifiedPolicy
 
             if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
                 output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")

@@ -9,12 +9,12 @@ import typer
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.config import LIMITS
-from turbopi.errors import ConfigError
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.bench.batch_table import BatchTable
-    from turbopi.serve.sizing import Fleet, Plan
+    from turbopi.serve.fleet.sizing import Fleet, Plan
 
 MOST_ROBOTS = 10_000
 DECODED = 500  # observations a second, by one server (docs/fleet.md)
@@ -76,7 +76,7 @@ def plan(
     predictions, and the output says so.
     """
     from turbopi.bench.batch_table import published_table, table_of_file
-    from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, plan_fleet
+    from turbopi.serve.fleet.sizing import OVERHEAD_MS, RAY_MS, Fleet, plan_fleet
 
     if gpu is not None and times is not None:
         raise ConfigError(f"--gpu {gpu} and --times {times} each name the times of a policy: give one of them")
@@ -100,7 +100,7 @@ def plan(
 
 def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
-    from turbopi.serve.fleet import MOST_AT_ONCE
+    from turbopi.serve.fleet.fleet import MOST_AT_ONCE
     from turbopi.serve.options import ServerOptions
 
     each = ", ".join(f"T({size}) {seconds * 1e3:.1f}" for size, seconds in table.seconds.items())

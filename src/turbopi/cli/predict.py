@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from turbopi.cli.framework import Output
-from turbopi.errors import ConfigError
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.bench.gpus import GpuSpec

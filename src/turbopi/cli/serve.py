@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from turbopi.cli.api_key import ApiKey, chosen_key
+from turbopi.cli.capabilities import check_server, check_warmup
 from turbopi.cli.files import check_folder
 from turbopi.cli.fleet_update import Asked
 from turbopi.cli.framework import Output, command, log_to_stderr
-from turbopi.cli.offers import check_server, check_warmup
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
-from turbopi.errors import ConfigError
 from turbopi.serve.options import MAX_BATCH, ServerOptions
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-    from turbopi.policy import UnifiedPolicy
-    from turbopi.running_chunk import JoinMode
+    from turbopi.policy.policy import UnifiedPolicy
+    from turbopi.realtime.running_chunk import JoinMode
 
 
 @command(

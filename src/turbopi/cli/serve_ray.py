@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from turbopi.cli.capabilities import check_server
 from turbopi.cli.fleet_update import Asked, as_before, changes, of_the_front, runs, scale_of, scaled_as
 from turbopi.cli.framework import Output
-from turbopi.cli.offers import check_server
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import BackendError, ConfigError
+from turbopi.support.errors import BackendError, ConfigError
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
-    from turbopi.policy import UnifiedPolicy
-    from turbopi.serve.fleet import FleetOptions
+    from turbopi.policy.policy import UnifiedPolicy
+    from turbopi.serve.fleet.fleet import FleetOptions
 
 _FLEET = "Many GPUs"
 
@@ -104,8 +104,8 @@ class FleetWishes:
 
     def options(self, asked: Asked, checkpoint: str | None) -> "FleetOptions":
         """The fleet's options. Raises ConfigError."""
-        from turbopi.serve.fleet import FleetOptions, line_of
-        from turbopi.serve.ray_app import gpus_for, name_of, read_autoscaling
+        from turbopi.serve.fleet.fleet import FleetOptions, line_of
+        from turbopi.serve.fleet.ray_app import gpus_for, name_of, read_autoscaling
 
         name = name_of(checkpoint, asked.policy.random_weights)
         use_gpus = gpus_for(asked.policy.device)
@@ -140,7 +140,7 @@ def serve_fleet(
     Raises ConfigError, CheckpointError, BackendUnavailable and BackendError for what can't be, and DeviceLost when
     Ray's cluster has ended.
     """
-    from turbopi.serve import fleet
+    from turbopi.serve.fleet import fleet
 
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks Ray after its end mustn't start another one
     fleet.import_ray()
@@ -165,8 +165,8 @@ def _serve(
     before_serving: Callable[[], None],
 ) -> None:
     from turbopi import serve as serving
-    from turbopi.serve import fleet
-    from turbopi.serve.fleet_name import claimed
+    from turbopi.serve.fleet import fleet
+    from turbopi.serve.fleet.name import claimed
 
     with claimed(options.name):
         fleet.check_is_fleet(options.name)
@@ -184,7 +184,7 @@ def _serve(
 
 def _check_orphan(name: str, policy: PolicyOptions, opened: "Checkpoint", output: Output) -> None:
     """Of a fleet whose server has ended without its replicas. Raises ConfigError if the new one doesn't fit."""
-    from turbopi.serve import fleet
+    from turbopi.serve.fleet import fleet
 
     try:
         metadata = fleet.Fleet.attach(name, fleet.REACH_SECONDS).metadata
@@ -196,7 +196,7 @@ def _check_orphan(name: str, policy: PolicyOptions, opened: "Checkpoint", output
 
 
 def _update(wishes: FleetWishes, asked: Asked, checkpoint: str | None, output: Output, given: Collection[str]) -> None:
-    from turbopi.serve import fleet
+    from turbopi.serve.fleet import fleet
 
     typed = asked.plain()
     name = wishes.name
@@ -231,8 +231,8 @@ def _open(asked: Asked, checkpoint: str | None, output: Output) -> "Checkpoint":
 
 def _deploy(options: "FleetOptions", asked: Asked, checkpoint: str | None, output: Output) -> int:
     """Start or replace the replicas; returns their number."""
-    from turbopi.serve import fleet
-    from turbopi.serve.ray_app import warm_up_of
+    from turbopi.serve.fleet import fleet
+    from turbopi.serve.fleet.ray_app import warm_up_of
 
     count, use_gpus = fleet.planned(options)
     make = partial(make_policy, asked.policy, _absolute(checkpoint), asked.strict)
@@ -288,7 +288,7 @@ def make_policy(options: PolicyOptions, checkpoint: str | None, strict: bool) ->
 @contextmanager
 def _cluster(console: Console) -> Iterator[bool]:
     """Ray, joined or started for this block; whether it was started."""
-    from turbopi.serve import fleet
+    from turbopi.serve.fleet import fleet
 
     with console.status("Starting Ray …"):
         ours = fleet.connect()

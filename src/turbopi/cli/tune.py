@@ -12,7 +12,7 @@ from turbopi.cli import files
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.cli.progress import with_stages
-from turbopi.errors import BackendError, BackendUnavailable, ConfigError, OutputError
+from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 
 if TYPE_CHECKING:
     import torch

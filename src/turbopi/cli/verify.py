@@ -11,9 +11,9 @@ from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
-from turbopi.files import write_whole
-from turbopi.reading import as_document, plain_document
-from turbopi.wording import cosine, denoising, significant
+from turbopi.support.files import write_whole
+from turbopi.support.reading import as_document, plain_document
+from turbopi.support.text import cosine, denoising, significant
 
 if TYPE_CHECKING:
     from turbopi.verify.document import CalibrationDetails, Certificate, Dimension, IntermediateDocument

@@ -8,7 +8,7 @@ import typer
 from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.files import check_writable
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -23,13 +23,13 @@ from turbopi.engine.backward import Expert, jacobian_velocity, way_back
 from turbopi.engine.call import Cache, Pictures
 from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.packing import most_tiles, pack_rows
-from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
 from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.denoise import euler_step, step_size
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.denoise import euler_step, step_size
 
 PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
 

@@ -18,18 +18,18 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.batches import Batches
+from turbopi.engine.cold_call import not_warm
 from turbopi.engine.conditioned import batch_form, batch_loop
 from turbopi.engine.graph import building
-from turbopi.engine.not_warm import not_warm
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.packing import split
-from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import BUCKET, GraphRunner, HostRow, floats, padded_trace
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
-from turbopi.model.conditioning import Conditioning, Conditionings, Form, check_rows, of_rows
-from turbopi.model.reference import Trace
-from turbopi.model.sample import Sample
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, check_rows, of_rows
+from turbopi.models.pi0.reference import Trace
+from turbopi.models.pi0.sample import Sample
 
 Asked = Sequence[Conditioning | None]  # of each observation
 Finish = Callable[[Sequence[np.ndarray], np.ndarray, np.ndarray, int, Asked], Sample]

@@ -19,11 +19,11 @@ from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix, SharedRows
 from turbopi.engine.call import Pictures
 from turbopi.engine.graph import Graph, Mark
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
-from turbopi.model.conditioning import Conditioning, Form
-from turbopi.model.sample import Sample
+from turbopi.models.pi0.conditioning import Conditioning, Form
+from turbopi.models.pi0.sample import Sample
 
 logger = logging.getLogger(__name__)
 

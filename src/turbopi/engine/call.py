@@ -21,12 +21,12 @@ from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, wa
 from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
 from turbopi.engine.graph import HEAD, Mark
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.denoise import euler_step
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.denoise import euler_step
 from turbopi.preprocess.images import fitted
 
 # Pictures that are sent together: while the device works on the head of some, the host copies the next ones, which it

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.flat import allocate
-from turbopi.engine.recent_loops import Loop
-from turbopi.errors import ObservationError
+from turbopi.engine.graph_cache import Loop
 from turbopi.kernels.interface import TokenInputs
-from turbopi.model.conditioning import Conditioning, Form, TokenTimes
-from turbopi.model.denoise import time_embedding, time_grid
+from turbopi.models.pi0.conditioning import Conditioning, Form, TokenTimes
+from turbopi.models.pi0.denoise import time_embedding, time_grid
+from turbopi.support.errors import ObservationError
 
 MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
 BY_ACTION = ("target", "weights")  # have no axis of steps

@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.model.layers import AdaRMSNorm, inverse_rms
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears, norm_of
+from turbopi.models.pi0.layers import AdaRMSNorm, inverse_rms
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears, norm_of
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions, ScaledMatrix
 from turbopi.quantization.sites import Site

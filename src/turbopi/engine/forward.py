@@ -2,7 +2,7 @@
 
 The prefix is compacted on the host: valid cameras, then valid prompt tokens, then padding up to the bucket. Padding
 sits at the end only and `length`, in device memory, says where it begins; so nothing is captured anew when the prompt
-or the state changes. The mathematics is `turbopi.model.reference`'s; only its order of work differs:
+or the state changes. The mathematics is `turbopi.models.pi0.reference`'s; only its order of work differs:
 
   - matrices that share an input are one product; adaRMS comes from a table of all steps;
   - a residual is added together with the norm behind it, or of many rows by the product in front of that, in place;
@@ -24,7 +24,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, Ops, State, VisionLayer
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.layers import rope_tables
 from turbopi.quantization.fp8 import input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]

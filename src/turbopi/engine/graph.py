@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from turbopi.kernels.nvrtc import capturing
-from turbopi.model.exact import exact_float32
+from turbopi.models.pi0.exact import exact_float32
 
 Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
 HEAD = "head"  # the mark that cuts a sequence: what is before it is a graph of its own, launched first

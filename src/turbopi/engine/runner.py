@@ -22,19 +22,19 @@ from torch import Tensor
 
 from turbopi.config import LIMITS, ImageResize, ModelConfig
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.cold_call import not_warm
 from turbopi.engine.conditioned import conditioned_loop
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.not_warm import not_warm
-from turbopi.engine.recent_loops import Loop, RecentLoops
+from turbopi.engine.graph_cache import Loop, RecentLoops
 from turbopi.engine.solving import evaluation_loops, solving
 from turbopi.engine.weights import Weights, modulation, modulation_at
-from turbopi.errors import BackendError, ObservationError
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
-from turbopi.model.conditioning import Conditioning, Conditionings, Form, of_rows
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Trace
-from turbopi.model.sample import Sample
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, of_rows
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Trace
+from turbopi.models.pi0.sample import Sample
+from turbopi.support.errors import BackendError, ObservationError
 
 logger = logging.getLogger(__name__)
 

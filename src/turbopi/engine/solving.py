@@ -14,9 +14,9 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent_loops import Loop
+from turbopi.engine.graph_cache import Loop
 from turbopi.kernels.interface import Denoiser, TokenInputs
-from turbopi.model.solvers import Integration
+from turbopi.models.pi0.solvers import Integration
 
 MakeDenoiser = Callable[[CallShape, Tensor | None], Denoiser | None]
 

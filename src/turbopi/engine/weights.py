@@ -15,9 +15,9 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
-from turbopi.engine.room import GATE_UP, QKV, is_conditioning, join
+from turbopi.engine.weight_placement import GATE_UP, QKV, is_conditioning, join
 from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
-from turbopi.model.denoise import time_embedding, time_grid
+from turbopi.models.pi0.denoise import time_embedding, time_grid
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix, whole_lines
 
 MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"

@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
-from turbopi.execution import way_named
-from turbopi.reading import shown
+from turbopi.realtime import way_named
 from turbopi.sim import SimSettings, Simulator
 from turbopi.sim.base import faults_named, observation_problem
+from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.reading import shown
 
 _FREE = "--execution sync, async and ensemble need nothing of the policy"
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_comparison_plot
 from turbopi.evaluate.results import Plain, Results
 from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
 from turbopi.evaluate.visited import ActionDifference
-from turbopi.files import write_whole
 from turbopi.quantization.calibration_file import RANDOM_NOISE
 from turbopi.quantization.formats import told_by
 from turbopi.quantization.plan import format_of
-from turbopi.reading import plain_document
-from turbopi.wording import significant
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document
+from turbopi.support.text import significant
 
 DOCUMENT = "compare.json"
 

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import Answer, PolicySource
-from turbopi.running_chunk import JoinMode
+from turbopi.realtime.running_chunk import JoinMode
+from turbopi.support.errors import ConfigError
 
 Control = Literal["prompt", "pictures"]
 CONTROLS: tuple[Control, ...] = ("prompt", "pictures")

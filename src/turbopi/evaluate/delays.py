@@ -12,16 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.pacing import PacedSummary, told_of_lateness
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.results import Episode, Plain, PolicyTold, Results, plain_object
 from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
-from turbopi.execution import WAYS, way_named
-from turbopi.files import write_whole
-from turbopi.plots import write_figure
-from turbopi.reading import plain_document, read_document
+from turbopi.realtime import WAYS, way_named
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.plots import write_figure
+from turbopi.support.reading import plain_document, read_document
 
 FORMAT: Final = 1
 FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "delays.png", "seams.png"

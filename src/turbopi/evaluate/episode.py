@@ -10,7 +10,7 @@ from turbopi.evaluate.frames import Frame, Reel
 from turbopi.evaluate.motion import Commands, Motion
 from turbopi.evaluate.pacing import Paced
 from turbopi.evaluate.plan import Job
-from turbopi.execution import ChunkQueue
+from turbopi.realtime import ChunkQueue
 from turbopi.sim import Environment
 
 # Asks the policy: (step, observation, what else it is told: `Request.arguments`) -> what `infer` returns, of which
@@ -36,7 +36,7 @@ class Ending:
 class Execution:
     """How chunks are carried out.
 
-    way           turbopi.execution.WAYS
+    way           turbopi.realtime.WAYS
     horizon       actions of a chunk after which the policy is asked again
     delay         control steps from an observation to the chunk computed from it. The episode's clock starts when the
                   first chunk is there

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from turbopi.execution import Seam
+from turbopi.realtime import Seam
 
 _Count = Annotated[int, Meta(ge=0, le=10**9)]
 _Length = Annotated[float, Meta(ge=0, le=1e12)]

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from turbopi.errors import ConfigError
-from turbopi.execution import way_named
+from turbopi.realtime import way_named
 from turbopi.sim import SimSettings, Simulator, Task
 from turbopi.sim.base import MAX_PX, faults_named
+from turbopi.support.errors import ConfigError
 
 MAX_CONTROL_HZ = 10_000
 VideoChoice = Literal["sample", "all", "none"]
@@ -23,7 +23,7 @@ class Protocol:
     replan       actions of a chunk that are carried out before the policy is asked again: the execution horizon
     image_px     pictures are resized to this square with padding before they are sent to the policy
     max_steps    control steps after the wait; None: the suite's own limit
-    execution    how chunks join: one of turbopi.execution.WAYS
+    execution    how chunks join: one of turbopi.realtime.WAYS
     delay        control steps from an observation to the chunk computed from it, simulated
     control_hz   in real time: control steps that the world makes in a second of the wall clock, whatever the policy
                  does; delays are measured then. None: the world waits for the policy

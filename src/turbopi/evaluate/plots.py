@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from turbopi.evaluate.results import Results, rate
 from turbopi.evaluate.statistics import Rate
-from turbopi.plots import MEASURED, MUTED, SOLVED, as_text, write_figure
+from turbopi.support.plots import MEASURED, MUTED, SOLVED, as_text, write_figure
 
 _DPI = 120
 

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.results import FILE, FORMAT, Results, RunDocument
-from turbopi.reading import Fields, as_document, read_json
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import Fields, as_document, read_json
 
 MAX_BYTES = 512 * 2**20  # of a run of 4,500 episodes: about 30 MB
 

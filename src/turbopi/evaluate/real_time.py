@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.episode import Ending, Execution, NoActions
 from turbopi.evaluate.frames import Frame, Reel
 from turbopi.evaluate.motion import Commands
@@ -19,6 +18,7 @@ from turbopi.evaluate.plan import Job
 from turbopi.realtime import Command, RealTimeExecutor
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.sim import Environment
+from turbopi.support.errors import ConfigError
 
 MAX_OBSERVATION_AGE_S: Final = 600.0  # far above any policy's latency: a slow policy is measured, not refused
 _STEP: Final = "turbopi.evaluate/step"  # the key under which an observation carries its step through the executor

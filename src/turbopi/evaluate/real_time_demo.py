@@ -13,8 +13,8 @@ from turbopi.evaluate.episode import Ending, Execution, run_episode
 from turbopi.evaluate.plan import Job, noise_seed
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.evaluate.statistics import Paired, Rate
-from turbopi.plots import MUTED, write_figure
 from turbopi.sim import SimSettings, create
+from turbopi.support.plots import MUTED, write_figure
 
 SIMULATOR = "chase"
 DELAY, HORIZON = 4, 5  # control steps

@@ -8,7 +8,7 @@ from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_plots
 from turbopi.evaluate.results import Episode, Results, Summary, rate
 from turbopi.evaluate.statistics import Rate, percentiles
-from turbopi.files import write_whole
+from turbopi.support.files import write_whole
 
 FILE = "report.html"
 

@@ -12,14 +12,14 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.motion import Motion
 from turbopi.evaluate.pacing import Paced, PacedSummary, rate_told, summarise_paced
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.statistics import Percentiles, Rate, RateDocument, percentiles
-from turbopi.files import write_whole
-from turbopi.reading import plain_document
 from turbopi.sim import Task
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document
 
 FORMAT: Final = 1
 FILE = "results.json"

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
 from turbopi.evaluate.reading import check_is_run, load_results
 from turbopi.evaluate.report import FILE as REPORT
@@ -21,11 +20,12 @@ from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
 from turbopi.evaluate.worker import WorkerSetup
 from turbopi.evaluate.workers import LOG
-from turbopi.files import alone_in
-from turbopi.provenance import provenance
-from turbopi.reading import plain_document
 from turbopi.sim import Simulator
 from turbopi.sim.base import faults_named
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import alone_in
+from turbopi.support.provenance import provenance
+from turbopi.support.reading import plain_document
 
 # Is told of every episode as it ends, with the results so far
 OnEpisode = Callable[[Episode, Results], None]

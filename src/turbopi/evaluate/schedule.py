@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ConfigError, TurboPiError
 from turbopi.evaluate.checks import actions_needed
 from turbopi.evaluate.motion import Motion
 from turbopi.evaluate.pacing import Paced
@@ -26,6 +25,7 @@ from turbopi.evaluate.worker import WorkerSetup
 from turbopi.evaluate.workers import LOG, WorkerHandle
 from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim import Simulator
+from turbopi.support.errors import ConfigError, TurboPiError
 
 MAX_CRASHES_IN_A_ROW = 5
 SILENCE_S = 600.0  # a worker that says nothing for so long hangs

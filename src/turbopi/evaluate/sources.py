@@ -8,15 +8,15 @@ from typing import Protocol as Interface
 import numpy as np
 import torch
 
-from turbopi.arguments import MAX_BATCH
-from turbopi.errors import ActionError, ConfigError, TurboPiError
-from turbopi.execution.messages import PREFIX, message
-from turbopi.execution.queue import of_batch
+from turbopi.policy.call_options import MAX_BATCH
 from turbopi.quantization.formats import told_by
-from turbopi.reading import is_finite, shown
-from turbopi.running_chunk import JoinMode
-from turbopi.wire import WireError, pack, unpack
-from turbopi.wording import denoising
+from turbopi.realtime.messages import PREFIX, message
+from turbopi.realtime.queue import of_batch
+from turbopi.realtime.running_chunk import JoinMode
+from turbopi.realtime.wire import WireError, pack, unpack
+from turbopi.support.errors import ActionError, ConfigError, TurboPiError
+from turbopi.support.reading import is_finite, shown
+from turbopi.support.text import denoising
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
@@ -74,9 +74,9 @@ class PolicySource(Interface):
     ) -> list[Answer]:
         """One answer for each observation; `seeds` draw the noise, where the source lets them.
 
-        Observations may have keys of `turbopi.execution.messages`, too, for a server that keeps the running chunk.
+        Observations may have keys of `turbopi.realtime.messages`, too, for a server that keeps the running chunk.
 
-        arguments   what each request tells the policy of the running chunk (turbopi.execution). None: nothing
+        arguments   what each request tells the policy of the running chunk (turbopi.realtime). None: nothing
         """
 
     def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
@@ -177,7 +177,7 @@ class RemotePolicy:
         """
         from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
 
-        from turbopi.policy_socket import PolicySocket
+        from turbopi.realtime.policy_socket import PolicySocket
 
         if host.startswith(("ws://", "wss://")):
             url = host if port is None else f"{host}:{port}"

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from turbopi.errors import OutputError, TurboPiError
 from turbopi.evaluate.frames import Frame, lengths
-from turbopi.files import new_file
+from turbopi.support.errors import OutputError, TurboPiError
+from turbopi.support.files import new_file
 
 VIEW = 320  # pixels of each camera's square
 PANEL = 150  # height of the chunk's plots
@@ -86,7 +86,7 @@ def _is_finished(film: Path) -> bool:
 
 def chunk_groups(robot: str, width: int) -> list[tuple[str, dict[int, str]]]:
     """How the action's numbers belong together: (title, {index: name})."""
-    from turbopi.showing import action_groups
+    from turbopi.support.action_groups import action_groups
 
     return [(group.title, dict(list(group.names.items())[: len(LINES)])) for group in action_groups(robot, width)]
 

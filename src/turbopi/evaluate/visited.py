@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job
 from turbopi.evaluate.sources import Answer, PolicySource
-from turbopi.files import write_whole
-from turbopi.reading import listing, read_npz
 from turbopi.recordings import Recorder
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import listing, read_npz
 
 FILE = "visited.npz"
 KEPT = 48

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from turbopi.kernels.interface import BackwardOps
 from turbopi.kernels.plain import geglu, masked_softmax, matmul_f32, rope_split
-from turbopi.model.layers import apply_rope, inverse_rms
+from turbopi.models.pi0.layers import apply_rope, inverse_rms
 
 _TANH = 0.7978845608028654  # sqrt(2 / pi), of GELU
 _CUBIC = 0.044715

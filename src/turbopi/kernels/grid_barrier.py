@@ -4,8 +4,8 @@ import ctypes
 
 import torch
 
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
+from turbopi.support.errors import BackendUnavailable
 
 THREADS = 512
 SOURCE = """

@@ -168,7 +168,7 @@ class BatchOps:
 
 @dataclass(frozen=True)
 class TokenInputs:
-    """A conditioned loop's inputs by action (model/conditioning.py), on the device, read when its kernels run.
+    """A conditioned loop's inputs by action (models/pi0/conditioning.py), on the device, read when its kernels run.
 
     Identity guidance is v ← v + gain · ((x − times · v) − target), so without guidance gain is 0.
     """

@@ -20,8 +20,8 @@ from typing import Any, Final
 
 import torch
 
-from turbopi.errors import BackendError, BackendUnavailable
-from turbopi.files import cache_folder, keep_in_cache
+from turbopi.support.errors import BackendError, BackendUnavailable
+from turbopi.support.files import cache_folder, keep_in_cache
 
 logger = logging.getLogger(__name__)
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import torch
 
-from turbopi.errors import ConfigError
 from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops
 from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
+from turbopi.support.errors import ConfigError
 
 KERNELS_VARIABLE = "TURBOPI_KERNELS"
 

@@ -17,8 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.kernels.interface import PILLOW_BITS, Ops, Taps
-from turbopi.model.layers import apply_rope, rms_normalize
-from turbopi.model.vision import normalize_images
+from turbopi.models.pi0.layers import apply_rope, rms_normalize
+from turbopi.models.pi0.vision import normalize_images
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.int8 import mark_damage, to_int8
 

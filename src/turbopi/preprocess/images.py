@@ -21,7 +21,7 @@ import torch
 from PIL import Image
 
 from turbopi.config import ImageResize
-from turbopi.errors import ObservationError
+from turbopi.support.errors import ObservationError
 
 
 @dataclass(frozen=True)

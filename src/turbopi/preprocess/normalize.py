@@ -10,7 +10,7 @@ import numpy as np
 
 from turbopi.checkpoint.norm_stats import NEEDS, FeatureStats
 from turbopi.config import NormMode
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.support.errors import ConfigError, ObservationError
 
 _OPENPI_EPS = 1e-6
 _LEROBOT_EPS = 1e-8

@@ -13,8 +13,7 @@ import numpy as np
 
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
-from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.observation import ModelInputs
+from turbopi.models.observation import ModelInputs
 from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
 from turbopi.preprocess.relative_actions import add_state, reanchored
@@ -27,8 +26,9 @@ from turbopi.preprocess.robot_checks import (
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.base import all_finite, keys_of, listed, read_prompt, read_state
-from turbopi.robots.pictures import check_hwc, is_rgb8, to_uint8
+from turbopi.robots.images import check_hwc, is_rgb8, to_uint8
 from turbopi.robots.plain import Plain
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
 _CAMERAS = frozenset(CAMERAS)
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.robots.base import Robot, RobotInputs
+from turbopi.support.errors import ActionError, ConfigError, ObservationError, TurboPiError
 
 
 def read_observation(robot: Robot, observation: Mapping[str, object]) -> RobotInputs:

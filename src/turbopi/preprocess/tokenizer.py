@@ -13,10 +13,10 @@ from typing import Protocol
 import numpy as np
 import sentencepiece
 
-from turbopi.errors import ObservationError, TokenizerError
-from turbopi.files import openpi_cache
 from turbopi.preprocess.tokenizer_json import TOKENIZER_JSON, TokenizerJson, differing_piece
-from turbopi.reading import read_bytes, shown
+from turbopi.support.errors import ObservationError, TokenizerError
+from turbopi.support.files import openpi_cache
+from turbopi.support.reading import read_bytes, shown
 
 logger = logging.getLogger(__name__)
 

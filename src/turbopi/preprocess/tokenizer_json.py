@@ -17,8 +17,8 @@ from typing import Any
 
 import sentencepiece
 
-from turbopi.errors import TokenizerError
-from turbopi.reading import MAX_JSON_BYTES, one_line, read_bytes, read_json, shown
+from turbopi.support.errors import TokenizerError
+from turbopi.support.reading import MAX_JSON_BYTES, one_line, read_bytes, read_json, shown
 
 TOKENIZER_JSON, TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
 _MAX_BYTES = 64 * 2**20  # PaliGemma's has 17 MB

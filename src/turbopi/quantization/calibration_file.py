@@ -15,13 +15,13 @@ from typing import Any
 import torch
 
 from turbopi.config import ModelConfig
-from turbopi.errors import CalibrationError, ConfigError
-from turbopi.files import write_whole
 from turbopi.quantization.formats import FORMATS, Format, Numbers
 from turbopi.quantization.fp8 import E4M3, Directions
 from turbopi.quantization.plan import TIERS, PrecisionPlan, format_of, reason_for_bf16
 from turbopi.quantization.sites import PARTS, Part, sites
-from turbopi.reading import is_finite, is_integer, one_line, read_json, shown
+from turbopi.support.errors import CalibrationError, ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import is_finite, is_integer, one_line, read_json, shown
 
 # version 1 has no directions; 2 has no scales for the expert's activations; 4 says `numbers`. FP8's files are written
 # as version 3, which older Turbo-Pis read, too.

@@ -13,16 +13,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from turbopi.config import Schedule
-from turbopi.errors import ConfigError
-from turbopi.execution import ChunkQueue, DelayEstimate, Execution, Seam, way_named
-from turbopi.execution.messages import PREFIX
-from turbopi.execution.queue import OLD_WEIGHT, summary
+from turbopi.realtime import ChunkQueue, DelayEstimate, Execution, Seam, way_named
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.realtime.journal import Command, Inferred, Journal, Kind, OutOfActions
+from turbopi.realtime.messages import PREFIX
 from turbopi.realtime.policies import check_policy, server_joins
+from turbopi.realtime.queue import OLD_WEIGHT, summary
+from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.realtime.settings import above_zero, checked_hold_action, held_values
 from turbopi.realtime.warm_up import expected_delay, warm_policy
-from turbopi.running_chunk import RunningChunk
+from turbopi.support.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ MAX_CONTROL_HZ = 10_000
 class RealTimeExecutor:
     """Runs a policy's chunks at a control rate, by one of the ways to run (docs/real_time.md).
 
-    policy             a UnifiedPolicy, turbopi.client.RealTimeClient, openpi's WebsocketClientPolicy, or whatever has
+    policy             a UnifiedPolicy, turbopi.realtime.RealTimeClient, openpi's WebsocketClientPolicy, or whatever has
                        `infer(observation)`. The executor alone calls it, on a thread of its own
     control_hz         how often the control loop calls `next_action`, times a second
     execution          "sync", "async", "ensemble", "rtc", "rtc_identity" or "rtc_trained"

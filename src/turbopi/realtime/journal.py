@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from turbopi.errors import TurboPiError
+from turbopi.support.errors import TurboPiError
 
 KEPT = 20_000  # commands: 400 s at 50 Hz
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from turbopi.plots import write_figure
 from turbopi.realtime.journal import Inferred, Journal
+from turbopi.support.plots import write_figure
 
 SHOWN = 600  # control steps; of a longer run, the last ones
 MOST_DIMS = 16

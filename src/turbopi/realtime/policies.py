@@ -4,8 +4,8 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
-from turbopi.errors import ConfigError
-from turbopi.execution import Way
+from turbopi.realtime import Way
+from turbopi.support.errors import ConfigError
 
 
 def metadata_of(policy: Any) -> Mapping[str, Any]:
@@ -28,7 +28,7 @@ def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
     if not _takes_previous(policy):
         raise ConfigError(
             f"execution {way.name!r} tells the policy of the running chunk, which {type(policy).__name__}.infer "
-            f"doesn't take: use a UnifiedPolicy, or turbopi.client.RealTimeClient for a server; {free}"
+            f"doesn't take: use a UnifiedPolicy, or turbopi.realtime.client.RealTimeClient for a server; {free}"
         )
     modes = list(offered.get("modes", ()))
     if not modes:

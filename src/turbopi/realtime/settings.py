@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 Hold = Literal["last"] | np.ndarray | None
 

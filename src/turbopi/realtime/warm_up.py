@@ -5,9 +5,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from turbopi.errors import ConfigError
-from turbopi.execution import Way
-from turbopi.running_chunk import RunningChunk
+from turbopi.realtime import Way
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.support.errors import ConfigError
 
 TIMED_CALLS = 2
 

@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ObservationError
-from turbopi.files import write_whole
-from turbopi.reading import Npz, is_finite, listing, parse_json, shown
-from turbopi.reading.arrays import is_unicode
 from turbopi.recordings.observation_folder import load_folder
+from turbopi.support.errors import ObservationError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import Npz, is_finite, listing, parse_json, shown
+from turbopi.support.reading.arrays import is_unicode
 
 FORMAT = "turbopi-recording"
 VERSION = 1

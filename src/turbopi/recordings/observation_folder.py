@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ObservationError
-from turbopi.reading import file_inside, is_finite, read_json, read_npy, shown
-from turbopi.reading.pictures import read_picture
+from turbopi.support.errors import ObservationError
+from turbopi.support.reading import file_inside, is_finite, read_json, read_npy, shown
+from turbopi.support.reading.images import read_picture
 
 FILE = "observation.json"
 _MAX_BYTES = 64 * 2**20  # numbers may be written out

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from turbopi.errors import ConfigError, OutputError
-from turbopi.files import append_line, write_whole
 from turbopi.recordings.format import FORMAT, VERSION, RecordedCall, save_call
+from turbopi.support.errors import ConfigError, OutputError
+from turbopi.support.files import append_line, write_whole
 
 logger = logging.getLogger(__name__)
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from turbopi.errors import ObservationError
 from turbopi.recordings.format import recorded_files
+from turbopi.support.errors import ObservationError
 
 
 def observation_files(path: Path) -> list[Path]:

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from turbopi.errors import ConfigError
 from turbopi.robots.aloha import Aloha
 from turbopi.robots.base import Robot, RobotInputs, find, has, optional_prompt, read_prompt, read_state, require
 from turbopi.robots.described import Described, load_robot, robot_from_dict
 from turbopi.robots.droid import Droid
+from turbopi.robots.images import parse_chw_image, parse_image, parse_unit_image
 from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.libero import Libero
-from turbopi.robots.pictures import parse_chw_image, parse_image, parse_unit_image
 from turbopi.robots.plain import Plain
 from turbopi.robots.raw_keys import ROBOT_TYPES, raw_description
+from turbopi.support.errors import ConfigError
 
 __all__ = [
     "ROBOTS",

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ObservationError
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -23,7 +22,8 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
-from turbopi.robots.pictures import parse_chw_image
+from turbopi.robots.images import parse_chw_image
+from turbopi.support.errors import ObservationError
 
 CAMERA_OF = {
     "cam_high": "base_0_rgb",

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from turbopi.config import CAMERAS
-from turbopi.errors import ObservationError
+from turbopi.support.errors import ObservationError
 
 
 @dataclass(frozen=True)

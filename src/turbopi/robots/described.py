@@ -9,8 +9,6 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from turbopi.config import CAMERAS, LIMITS
-from turbopi.errors import ConfigError
-from turbopi.reading import is_finite, is_integer, listing, read_json, shown
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -21,7 +19,9 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
-from turbopi.robots.pictures import parse_image
+from turbopi.robots.images import parse_image
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import is_finite, is_integer, listing, read_json, shown
 
 REQUIRED = ("name", "cameras", "state", "action_dim")
 _MOST = LIMITS["action_dim"]  # numbers in a state or an action: no model takes more

@@ -15,7 +15,7 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
-from turbopi.robots.pictures import parse_image
+from turbopi.robots.images import parse_image
 
 KEYS = (
     "observation/exterior_image_1_left",

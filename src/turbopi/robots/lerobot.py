@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ConfigError, ObservationError
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -25,7 +24,8 @@ from turbopi.robots.base import (
     read_state,
     require,
 )
-from turbopi.robots.pictures import parse_unit_image
+from turbopi.robots.images import parse_unit_image
+from turbopi.support.errors import ConfigError, ObservationError
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from turbopi.config import CAMERAS
-from turbopi.errors import ObservationError
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -20,7 +19,8 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
-from turbopi.robots.pictures import parse_image
+from turbopi.robots.images import parse_image
+from turbopi.support.errors import ObservationError
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.reading import listing, read_json, shown
 from turbopi.robots.base import Robot, RobotInputs, find, has, keys_of, listed, read_state, require
 from turbopi.robots.lerobot import IMAGES, STATE, TASK, LeRobot
+from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.reading import listing, read_json, shown
 
 _ARM = (
     *("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos"),

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from turbopi.errors import ObservationError
-from turbopi.execution.messages import PREFIX
+from turbopi.realtime.messages import PREFIX
 from turbopi.serve.calls import Calls
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
 from turbopi.serve.real_time import Plan, RealTime
 from turbopi.serve.rows import TIMING, check_rows, row, stacked, summed
-from turbopi.serve.schedule import Request
+from turbopi.serve.scheduling.schedule import Request
 from turbopi.serve.urgency import Urgency, check_batch, read_urgency
+from turbopi.support.errors import ObservationError
 
 
 @dataclass(frozen=True)

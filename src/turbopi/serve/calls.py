@@ -10,16 +10,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
-from turbopi.execution.chunk import checked_answer
-from turbopi.execution.queue import of_batch
-from turbopi.running_chunk import RunningChunk
-from turbopi.serve.batch_times import BatchTimes
+from turbopi.realtime.chunk import checked_answer
+from turbopi.realtime.queue import of_batch
+from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
-from turbopi.serve.schedule import Request, Schedule
-from turbopi.serve.worker import Ran, Worker
+from turbopi.serve.scheduling.batch_times import BatchTimes
+from turbopi.serve.scheduling.schedule import Request, Schedule
+from turbopi.serve.scheduling.worker import Ran, Worker
+from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError
 
 logger = logging.getLogger(__name__)
 

@@ -18,11 +18,11 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
+from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.straight import SpareBuffer, StraightFrame, apply_mask, goes_straight
-from turbopi.wire import Unpacker
+from turbopi.serve.zero_copy import SpareBuffer, StraightFrame, apply_mask, goes_straight
 
 AHEAD = 2  # messages of one client: one that is computed, one that waits
 READ_BYTES = 512 * 1024  # at most, in one read of a socket: two pictures of 224 x 224 are 300 KB

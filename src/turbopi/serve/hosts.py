@@ -16,7 +16,7 @@ import socket
 from collections.abc import Iterable, Sequence
 from urllib.parse import SplitResult, urlsplit
 
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 # What browsers add to a websocket's handshake: each of them several, and a page chooses none of them.

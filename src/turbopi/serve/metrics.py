@@ -5,7 +5,7 @@ from collections.abc import Callable
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from turbopi.serve.schedule import PRIORITIES
+from turbopi.serve.scheduling.schedule import PRIORITIES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turbopi.errors import ConfigError
 from turbopi.serve.hosts import LOOPBACK, AllowedHosts
 from turbopi.serve.limits import Limits
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
-    from turbopi.running_chunk import JoinMode
+    from turbopi.realtime.running_chunk import JoinMode
 
 MAX_BATCH = 64
 MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.execution import DelayEstimate
-from turbopi.execution.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
-from turbopi.execution.queue import default_execution_horizon
-from turbopi.running_chunk import JoinMode, RunningChunk
+from turbopi.realtime import DelayEstimate
+from turbopi.realtime.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
+from turbopi.realtime.queue import default_execution_horizon
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
+from turbopi.support.errors import ConfigError, ObservationError
 
 NO_JOINING = "none"  # a mode: the session is there for the order of its requests alone
 MAX_SESSIONS = 256  # named ones with a chunk; a connection's own ends with it

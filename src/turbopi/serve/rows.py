@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ObservationError
-from turbopi.execution.messages import PREFIX
+from turbopi.realtime.messages import PREFIX
+from turbopi.support.errors import ObservationError
 
 TIMING = "policy_timing"
 

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from turbopi.errors import ConfigError, DeviceLost, ObservationError
+from turbopi.realtime.wire import Unpacker, WireError, pack, unpack
 from turbopi.recordings import Recorder
 from turbopi.serve.asking import Asking, Askings
 from turbopi.serve.calls import Calls, Policy, PolicyCalls
@@ -47,7 +47,7 @@ from turbopi.serve.page.live import Live
 from turbopi.serve.real_time import RealTime
 from turbopi.serve.rows import row
 from turbopi.serve.signals import stop_signals
-from turbopi.wire import Unpacker, WireError, pack, unpack
+from turbopi.support.errors import ConfigError, DeviceLost, ObservationError
 
 logger = logging.getLogger(__name__)
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from turbopi.errors import ObservationError
-from turbopi.execution.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
+from turbopi.realtime.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
-from turbopi.serve.schedule import PRIORITIES, Priority
+from turbopi.serve.scheduling.schedule import PRIORITIES, Priority
+from turbopi.support.errors import ObservationError
 
 MAX_ROWS = 1024
 

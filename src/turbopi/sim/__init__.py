@@ -3,8 +3,8 @@
 import importlib
 from typing import Any
 
-from turbopi.errors import ConfigError
 from turbopi.sim.base import Environment, SimSettings, Simulator, SimulatorUnavailable, Task
+from turbopi.support.errors import ConfigError
 
 __all__ = ["SIMULATORS", "Environment", "SimSettings", "Simulator", "SimulatorUnavailable", "Task", "create"]
 

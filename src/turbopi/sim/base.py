@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from msgspec import Meta, Struct
 
-from turbopi.errors import ConfigError, TurboPiError
+from turbopi.support.errors import ConfigError, TurboPiError
 
 Seeding = Literal["episode", "task"]
 

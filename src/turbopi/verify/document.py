@@ -9,8 +9,8 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from turbopi.provenance import Provenance
 from turbopi.quantization.formats import told_by
+from turbopi.support.provenance import Provenance
 
 Number = float | None
 Count = Annotated[int, Meta(ge=0)]
@@ -199,7 +199,7 @@ class Certificate(Judged, frozen=True, kw_only=True):
     precision: str
     steps: int  # of denoising
     oracle: str
-    oracle_float32: Mapping[str, object]  # what PyTorch was told of float32's products: model/exact.py
+    oracle_float32: Mapping[str, object]  # what PyTorch was told of float32's products: models/pi0/exact.py
     control: str
     not_exposed: list[str]  # the reference's intermediates that the backend doesn't show
     latency_ms: Latencies

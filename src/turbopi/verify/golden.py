@@ -19,9 +19,9 @@ import torch
 
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, Normalization, PolicyConfig, VisionConfig
-from turbopi.errors import CheckpointError, ObservationError
-from turbopi.observation import Observation
-from turbopi.reading import read_json, read_npz
+from turbopi.models.observation import Observation
+from turbopi.support.errors import CheckpointError, ObservationError
+from turbopi.support.reading import read_json, read_npz
 
 VARIANTS = ("torch_fp32", "jax_fp32", "torch_bf16", "jax_bf16")
 Arrays = dict[str, np.ndarray]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from turbopi import shipped
-from turbopi.examples import Example, NoisyExample, prepared, with_noises
-from turbopi.policy import UnifiedPolicy
+from turbopi.policy import shipped
+from turbopi.policy.examples import Example, NoisyExample, prepared, with_noises
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.recordings import load_observation
 from turbopi.recordings.sources import chosen_files
 

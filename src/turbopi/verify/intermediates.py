@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.model.reference import Trace
-from turbopi.observation import ModelInputs
+from turbopi.models.observation import ModelInputs
+from turbopi.models.pi0.reference import Trace
+from turbopi.support.text import significant
 from turbopi.verify.document import ErrorsDocument, finite
-from turbopi.wording import significant
 
 _PREFIX = ("prefix_pad_mask", "prefix_positions", "vision_last_hidden", "prefix_embs")
 BY_LAYER = ("kv_k", "kv_v")

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from turbopi.plots import BOUND, STAGES, as_text, write_figure
+from turbopi.support.plots import BOUND, STAGES, as_text, write_figure
 from turbopi.verify.document import Certificate, IntermediateDocument, Number
 
 # tensor -> label and colour: the stage's, and a darker one

@@ -15,18 +15,19 @@ import numpy as np
 import torch
 from msgspec.structs import asdict
 
-from turbopi import backends, shipped
+from turbopi import backends
 from turbopi.backends.pytorch import reference_model
 from turbopi.calibrate.run import Progress
 from turbopi.checkpoint import Checkpoint
 from turbopi.checkpoint.calibration import calibration_of
 from turbopi.engine.graph import empty_cache
-from turbopi.errors import BackendError, CheckpointError
-from turbopi.examples import NoisyExample
-from turbopi.model import exact
-from turbopi.policy import UnifiedPolicy
-from turbopi.provenance import provenance
+from turbopi.models.pi0 import exact
+from turbopi.policy import shipped
+from turbopi.policy.examples import NoisyExample
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
+from turbopi.support.errors import BackendError, CheckpointError
+from turbopi.support.provenance import provenance
 from turbopi.verify import control
 from turbopi.verify.document import Certificate, Latencies, Latency, ObservationsDocument, WeightsDocument
 from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, read_examples

@@ -7,10 +7,11 @@ import numpy as np
 from msgspec.structs import asdict
 
 from turbopi.engine.emulate import NO_SIGNAL, has_signal
-from turbopi.errors import BackendError, ConfigError
-from turbopi.examples import NoisyExample
+from turbopi.policy.examples import NoisyExample
 from turbopi.quantization.plan import TIERS
-from turbopi.showing import action_groups
+from turbopi.support.action_groups import action_groups
+from turbopi.support.errors import BackendError, ConfigError
+from turbopi.support.text import significant
 from turbopi.verify.bounds import (
     BF16_FACTOR,
     BOUND_FACTORS,
@@ -38,7 +39,6 @@ from turbopi.verify.document import (
     finite,
 )
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
-from turbopi.wording import significant
 
 ACTIONS = Place("actions")
 Control = Literal["bf16", "jitter"]

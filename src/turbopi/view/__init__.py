@@ -9,7 +9,7 @@ viewer.py    opening the viewer
 
 from importlib.util import find_spec
 
-from turbopi.installation import install_command
+from turbopi.support.installation import install_command
 
 
 def unavailable() -> str | None:

@@ -19,7 +19,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from turbopi.showing import ActionGroup, action_groups
+from turbopi.support.action_groups import ActionGroup, action_groups
 from turbopi.view.calls import ViewedCall, ViewedTrouble
 from turbopi.view.viewer import open_viewer
 

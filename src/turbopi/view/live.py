@@ -10,9 +10,9 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from turbopi.errors import ConfigError
 from turbopi.serve.page.http import FEED
 from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Look, RobotFrame, Trouble, clean
+from turbopi.support.errors import ConfigError
 from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
 
 MAX_MESSAGE = 64 * 2**20

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from turbopi.errors import ObservationError
-from turbopi.reading import is_finite, read_json
 from turbopi.recordings import load_call, recorded_files
-from turbopi.showing import pictures_of
+from turbopi.support.action_groups import pictures_of
+from turbopi.support.errors import ObservationError
+from turbopi.support.reading import is_finite, read_json
 from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
 
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 COMMAND = (sys.executable, "-m", "rerun_cli", "--bind=127.0.0.1", "--expect-data-soon")
 SECONDS = 60.0  # until it listens

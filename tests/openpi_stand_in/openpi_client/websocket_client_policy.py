@@ -4,7 +4,7 @@ from typing import Any
 
 from websockets.sync.client import connect
 
-from turbopi.wire import pack, unpack
+from turbopi.realtime.wire import pack, unpack
 
 
 class WebsocketClientPolicy:

@@ -11,7 +11,7 @@ from turbopi.cli.files import check_folder, check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, describe
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 from turbopi_lab.studies import OF_CHECKPOINTS, STUDIES, check_names, load
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def study(
     policies = _policies(policy or [])
     from turbopi import backends
     from turbopi.cli.build import given_observations
-    from turbopi.reading import plain_document
+    from turbopi.support.reading import plain_document
     from turbopi_lab.studies.report import write
     from turbopi_lab.studies.study import Setup
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.support.errors import CheckpointError, ConfigError
 
 KINDS = ("pi05", "pi0")
 NO_TRAINING = (

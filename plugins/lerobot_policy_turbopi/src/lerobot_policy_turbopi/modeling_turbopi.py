@@ -21,11 +21,11 @@ from torch import Tensor
 
 from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiConfig
 from turbopi import UnifiedPolicy, open_checkpoint
-from turbopi.arguments import checked_steps
-from turbopi.errors import ActionError, CheckpointError, ConfigError, ObservationError
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.policy.call_options import checked_steps
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
-from turbopi.reading import file_inside, read_json
+from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
+from turbopi.support.reading import file_inside, read_json
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from typing import Any
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_turbopi.configuration_turbopi import TurboPiConfig
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 
 def make_turbopi_pre_post_processors(

@@ -7,7 +7,7 @@ from torch import Tensor
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions, ScaledMatrix, channel_scales
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
-from turbopi.toolchain import make_caches_writable
+from turbopi.support.toolchain import make_caches_writable
 
 
 def quantize(

@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import torch
 
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.arguments import Parameters
 from turbopi.kernels.nvrtc import Kernel, bindings, checked
+from turbopi.support.errors import BackendUnavailable
 
 SHARED_BYTES = 227 * 1024
 

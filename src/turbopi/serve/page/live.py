@@ -23,7 +23,6 @@ from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.limited_log import peer
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.page.device import memory_of
-from turbopi.serve.page.look import look_at
 from turbopi.serve.page.messages import (
     FEED_VERSION,
     Frame,
@@ -35,7 +34,8 @@ from turbopi.serve.page.messages import (
     Trouble,
     clean,
 )
-from turbopi.showing import action_groups
+from turbopi.serve.page.preview import look_at
+from turbopi.support.action_groups import action_groups
 from turbopi.version import turbopi_version
 
 logger = logging.getLogger(__name__)

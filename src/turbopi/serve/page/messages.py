@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from turbopi.showing import ActionGroup
+from turbopi.support.action_groups import ActionGroup
 
 FEED_VERSION = 1
 

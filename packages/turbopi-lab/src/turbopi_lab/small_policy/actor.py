@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.model.denoise import euler_step, run_expert, time_embedding, time_grid
-from turbopi.model.layers import rope_tables
-from turbopi.model.prefix import embed_images, embed_prompt, prefix_keys_values
-from turbopi.model.reference import Pi0Model, parameter_dtype
+from turbopi.models.pi0.denoise import euler_step, run_expert, time_embedding, time_grid
+from turbopi.models.pi0.layers import rope_tables
+from turbopi.models.pi0.prefix import embed_images, embed_prompt, prefix_keys_values
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 from turbopi.preprocess.normalize import Normalizer
 from turbopi_lab.small_policy.episodes import HORIZON, IMAGE_PX
 

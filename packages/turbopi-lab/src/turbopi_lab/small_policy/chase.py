@@ -22,7 +22,7 @@ from torch import Tensor
 
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, RealTime, VisionConfig
-from turbopi.model.reference import Pi0Model
+from turbopi.models.pi0.reference import Pi0Model
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.sim.chase import BLOB, INSTRUCTION, MAX_STEPS, POST, SPEED, VIEWS, Chase, cut
 from turbopi.sim.chase_expert import choose_sides, keep_sides, plan

@@ -30,8 +30,8 @@ from torch import Tensor
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.config import RealTime
-from turbopi.model.reference import Pi0Model, Trace
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi_lab.small_policy import chase, post
 from turbopi_lab.small_policy.chase import WEIGHTS, Frames, stats
 from turbopi_lab.small_policy.export import export

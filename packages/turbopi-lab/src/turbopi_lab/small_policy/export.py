@@ -12,7 +12,7 @@ from turbopi.checkpoint.convert import convert
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape
 from turbopi.config import PolicyConfig, preset
-from turbopi.model.reference import FloatPrecision
+from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi_lab.small_policy.episodes import HORIZON
 

@@ -1,6 +1,6 @@
 """Training's view of the model: prefix and suffix in one pass, with gradients, on the project's own modules.
 
-`turbopi.model.reference` computes an observation's keys and values first and the velocity at one time after that,
+`turbopi.models.pi0.reference` computes an observation's keys and values first and the velocity at one time after that,
 without gradients. Here each row of a batch has its own time, and a layer of the language model and the layer of the
 action expert beside it run together. A test holds both against each other.
 
@@ -18,12 +18,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.config import ModelConfig
-from turbopi.model.denoise import MAX_PERIOD, MIN_PERIOD
-from turbopi.model.gemma import Layer
-from turbopi.model.layers import gated_residual, rms_normalize, rope_tables
-from turbopi.model.prefix import embed_prompt
-from turbopi.model.reference import Pi0Model
-from turbopi.model.vision import EncoderLayer
+from turbopi.models.pi0.denoise import MAX_PERIOD, MIN_PERIOD
+from turbopi.models.pi0.gemma import Layer
+from turbopi.models.pi0.layers import gated_residual, rms_normalize, rope_tables
+from turbopi.models.pi0.prefix import embed_prompt
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.vision import EncoderLayer
 
 Rope = tuple[Tensor, Tensor]
 
@@ -188,7 +188,7 @@ def _ropes(valid: Tensor, repeated: Tensor, horizon: int, config: ModelConfig) -
 
 
 def time_embedding(t: Tensor, width: int) -> Tensor:
-    """As `turbopi.model.denoise.time_embedding`, on t's device: float32[B, width]."""
+    """As `turbopi.models.pi0.denoise.time_embedding`, on t's device: float32[B, width]."""
     fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=t.device)
     period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** fraction
     angle = t.double()[:, None] * (2 * torch.pi / period)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Episode, Results, plain_object, rate
 from turbopi.evaluate.statistics import Paired, PairedDocument, RateDocument
-from turbopi.files import write_whole
-from turbopi.reading import plain_document, read_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document, read_document
 
 PLAIN = {  # by name: the runs without delay, and the controls
     "float32": "`pytorch`, float32",

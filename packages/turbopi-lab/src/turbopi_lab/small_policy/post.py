@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from turbopi import shipped
 from turbopi.config import PolicyConfig, RealTime
+from turbopi.policy import shipped
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.sim.chase_expert import plan
 from turbopi_lab.small_policy.chase import CONFIG as CHASE

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.config import ModelConfig
-from turbopi.model.reference import Pi0Model
+from turbopi.models.pi0.reference import Pi0Model
 
 
 def fresh_model(config: ModelConfig, seed: int) -> Pi0Model:

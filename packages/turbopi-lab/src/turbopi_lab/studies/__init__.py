@@ -17,7 +17,7 @@ import importlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from turbopi.errors import ConfigError
+from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
     from turbopi_lab.studies.study import Study

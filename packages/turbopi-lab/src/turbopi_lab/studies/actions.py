@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from msgspec import Struct
 
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
-from turbopi.wording import cosine, significant
+from turbopi.models.observation import Observation
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.reading import plain_document
+from turbopi.support.text import cosine, significant
 from turbopi_lab.studies.differences import errors_of
 from turbopi_lab.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series
 from turbopi_lab.studies.study import Setup, Study

@@ -12,10 +12,10 @@ from torch import Tensor
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.evaluate.plan import Job, Protocol, noise_seed
 from turbopi.evaluate.sources import Answer, LocalPolicy
-from turbopi.model.conditioning import Conditionings
-from turbopi.model.sample import Sample
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditionings
+from turbopi.models.pi0.sample import Sample
+from turbopi.policy.policy import UnifiedPolicy
 
 Key = tuple[int, int]  # of an episode: task, initial state
 

@@ -16,15 +16,16 @@ import numpy as np
 import torch
 from msgspec import Struct
 
-from turbopi import backends, shipped
+from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint
-from turbopi.files import write_whole
+from turbopi.policy import shipped
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import FP8_TIERS
-from turbopi.reading import plain_document
 from turbopi.recordings import RecordedCall, save_call
+from turbopi.support.files import write_whole
+from turbopi.support.reading import plain_document
 from turbopi.verify.document import (
     ActionsControl,
     Bounds,

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from msgspec import Struct, structs
 
-from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.reading import plain_document
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies.report import (
     MARGIN,
     Cell,

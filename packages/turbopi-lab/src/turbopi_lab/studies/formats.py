@@ -7,9 +7,9 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-import turbopi.model.gemma
-import turbopi.model.vision
-from turbopi.model.layers import attention
+import turbopi.models.pi0.gemma
+import turbopi.models.pi0.vision
+from turbopi.models.pi0.layers import attention
 from turbopi.quantization.fp8 import E4M3_MAX, Directions, to_e4m3
 from turbopi.quantization.rounding import columns_with_feedback, feedback
 
@@ -99,7 +99,7 @@ def attention_in_fp8(*stacks: str) -> Iterator[None]:
 
     Queries, keys and values with a scale for each tensor, from its own values; probabilities times 448.
     """
-    modules: dict[str, ModuleType] = {"vision": turbopi.model.vision, "gemma": turbopi.model.gemma}
+    modules: dict[str, ModuleType] = {"vision": turbopi.models.pi0.vision, "gemma": turbopi.models.pi0.gemma}
     chosen = [modules[stack] for stack in stacks]
     try:
         for module in chosen:

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from turbopi.bench.work import Job, stage_work
 from turbopi.config import preset
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears
 from turbopi.quantization.fp8 import E4M3_MAX
 from turbopi.quantization.sites import sites
 from turbopi_lab.studies.formats import (

@@ -13,7 +13,6 @@ import torch
 from msgspec import Struct
 from torch import Tensor
 
-from turbopi import shipped
 from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.statistics import collect
 from turbopi.checkpoint import open_checkpoint
@@ -27,13 +26,14 @@ from turbopi.engine.emulate import (
     rounded,
 )
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sites import linears
-from turbopi.provenance import Provenance
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.sites import linears
+from turbopi.policy import shipped
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
-from turbopi.reading import plain_document
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies.formats import attention_in_fp8, nvfp4_without_scales, round_mxfp4, round_nvfp4
 from turbopi_lab.studies.fp4_products import (
     UNREAD,

@@ -6,12 +6,12 @@ from functools import partial
 
 import torch
 
-from turbopi import shipped
 from turbopi.backends.pytorch import reference_model
 from turbopi.calibrate.observations import Batch
 from turbopi.evaluate.sources import PolicySource
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.observation import Observation
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.sites import sites
 from turbopi_lab.studies.fp8_and_fp4 import CLAIMED, WRONG, cases, in_four_bits
 from turbopi_lab.studies.simulated import STEPS, Given, Variant, Variants

@@ -27,13 +27,13 @@ from torch import Tensor
 from turbopi.bench.work import Job, stage_work
 from turbopi.config import preset
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.model.exact import exact_float32
-from turbopi.model.kv_cache import EmbeddedPrefix, KVCache
-from turbopi.model.layers import gated_residual, rope_tables
-from turbopi.model.prefix import camera_slots
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
-from turbopi.reading import plain_document
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.exact import exact_float32
+from turbopi.models.pi0.kv_cache import EmbeddedPrefix, KVCache
+from turbopi.models.pi0.layers import gated_residual, rope_tables
+from turbopi.models.pi0.prefix import camera_slots
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies.report import (
     MARGIN,
     PERCENT,

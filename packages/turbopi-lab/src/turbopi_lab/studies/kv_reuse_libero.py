@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbopi.backends.pytorch import reference_model
 from turbopi.evaluate.sources import PolicySource
-from turbopi.files import append_line, whole_lines
+from turbopi.support.files import append_line, whole_lines
 from turbopi_lab.studies.answering import Asked
 from turbopi_lab.studies.kv_reuse import CLAIMED, NOTHING, Reuse, Reusing, speed_ups
 from turbopi_lab.studies.simulated import PLAIN, Given, Variant, Variants, open_plain

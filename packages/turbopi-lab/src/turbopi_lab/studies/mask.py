@@ -15,12 +15,12 @@ from torch import Tensor
 
 from turbopi.backends.pytorch import reference_model
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
-from turbopi.wording import cosine, significant
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.reading import plain_document
+from turbopi.support.text import cosine, significant
 from turbopi_lab.studies.differences import errors_of
 from turbopi_lab.studies.problems import one_problem
 from turbopi_lab.studies.report import (

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies.report import (
     PERCENT,
     Cell,

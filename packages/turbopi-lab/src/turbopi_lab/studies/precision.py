@@ -15,18 +15,18 @@ from msgspec import Struct
 from torch import Tensor
 
 from turbopi.backends.pytorch import reference_model
-from turbopi.model.kv_cache import EmbeddedPrefix
-from turbopi.model.layers import rope_tables
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
-from turbopi.tensorrt import Library, library
-from turbopi.tensorrt.call import Part
-from turbopi.tensorrt.engine import Engine, Input, Specification, build
-from turbopi.tensorrt.networks import LayerStyle, prefix_layer
-from turbopi.tensorrt.ops import TORCH_DTYPES, Dtype
-from turbopi.wording import cosine, significant
+from turbopi.backends.tensorrt import Library, library
+from turbopi.backends.tensorrt.call import Part
+from turbopi.backends.tensorrt.engine import Engine, Input, Specification, build
+from turbopi.backends.tensorrt.networks import LayerStyle, prefix_layer
+from turbopi.backends.tensorrt.ops import TORCH_DTYPES, Dtype
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.kv_cache import EmbeddedPrefix
+from turbopi.models.pi0.layers import rope_tables
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.reading import plain_document
+from turbopi.support.text import cosine, significant
 from turbopi_lab.studies.differences import Off, errors_of
 from turbopi_lab.studies.problems import one_problem
 from turbopi_lab.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series

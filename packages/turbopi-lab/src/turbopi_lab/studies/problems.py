@@ -8,15 +8,15 @@ import torch
 from msgspec import Struct
 from torch import Tensor
 
-from turbopi import shipped
 from turbopi.calibrate.observations import Batch
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import Solver
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model
-from turbopi.model.solvers import GRIDS, intervals
-from turbopi.observation import Observation
-from turbopi.policy import UnifiedPolicy
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.solvers import GRIDS, intervals
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi_lab.studies.solvers import Learned, Way, begins, grid_times, learn_times, solve, ways

@@ -14,11 +14,11 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from msgspec import Struct
 
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.files import write_whole
-from turbopi.plots import as_text, write_figure
-from turbopi.provenance import Provenance
-from turbopi.reading import plain_document
-from turbopi.wording import significant
+from turbopi.support.files import write_whole
+from turbopi.support.plots import as_text, write_figure
+from turbopi.support.provenance import Provenance
+from turbopi.support.reading import plain_document
+from turbopi.support.text import significant
 
 JSON, MARKDOWN = "report.json", "report.md"
 PERCENT = "%, with Wilson's interval, 95 %"  # what axis of `rate_series` says

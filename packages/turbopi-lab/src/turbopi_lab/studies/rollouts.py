@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi import shipped
 from turbopi.checkpoint import open_checkpoint
 from turbopi.config import PolicyConfig
 from turbopi.evaluate.statistics import Paired, Rate
-from turbopi.model.reference import Pi0Model
-from turbopi.observation import Observation
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.policy import shipped
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.sim import chase
 from turbopi.sim.chase import Chase

@@ -16,18 +16,18 @@ from typing import Any
 import torch
 from msgspec import Struct
 
-from turbopi import shipped
 from turbopi.checkpoint import Checkpoint, open_checkpoint
-from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan, choose_tasks, make_jobs
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import FILE, Episode, Results
 from turbopi.evaluate.run import default_workers, evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document, shown
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.sim import SimSettings, Simulator, Task, create
+from turbopi.support.errors import ConfigError
+from turbopi.support.reading import plain_document, shown
 from turbopi_lab.studies.answering import Answering, AnsweringPolicy
 from turbopi_lab.studies.report import (
     MARGIN,

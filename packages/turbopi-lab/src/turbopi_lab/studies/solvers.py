@@ -1,4 +1,4 @@
-"""The cells of studies of few evaluations: solvers (model/solvers.py), time grids, grids learned for a policy."""
+"""The cells of studies of few evaluations: solvers (models/pi0/solvers.py), time grids, grids learned for a policy."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from turbopi.config import GridName, Solver
-from turbopi.model.conditioning import Conditioning
-from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model
-from turbopi.model.solvers import GRIDS as NAMED
-from turbopi.model.solvers import SOLVERS, Integration, intervals
-from turbopi.model.solvers import grid_times as named_times
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.solvers import GRIDS as NAMED
+from turbopi.models.pi0.solvers import SOLVERS, Integration, intervals
+from turbopi.models.pi0.solvers import grid_times as named_times
 
 Times = Sequence[float]  # falling; where intervals begin
 GRIDS: dict[str, GridName | None] = {name.replace("_", " "): name for name in NAMED} | {"learned": None}

@@ -15,10 +15,10 @@ import torch
 from msgspec import Struct
 from torch import Tensor
 
-from turbopi import shipped
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.reading import plain_document
+from turbopi.policy import shipped
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies import solvers
 from turbopi_lab.studies.problems import EXACT, ErrorCell, Problem, errors, learned_grids, libero_problems
 from turbopi_lab.studies.report import (

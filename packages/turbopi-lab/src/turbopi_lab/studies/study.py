@@ -12,11 +12,12 @@ from typing import TypeVar
 
 import torch
 
-from turbopi import backends, shipped
+from turbopi import backends
 from turbopi.checkpoint import Checkpoint
-from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.policy import UnifiedPolicy
-from turbopi.provenance import provenance
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.provenance import provenance
 from turbopi_lab.studies.report import Report
 
 FEWEST_EPISODES = 200  # of a cell that a conclusion rests on

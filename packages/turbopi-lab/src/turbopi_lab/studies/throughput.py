@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.support.reading import plain_document
 from turbopi_lab.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series
 from turbopi_lab.studies.study import Setup, Study
 

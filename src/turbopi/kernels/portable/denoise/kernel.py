@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
+from turbopi.support.errors import BackendError, BackendUnavailable
 
 PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
 MAX_SUFFIX = 64

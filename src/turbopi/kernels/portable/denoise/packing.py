@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from turbopi.config import GemmaConfig, ModelConfig
-from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization import sites
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import E4M3, Directions
+from turbopi.support.errors import BackendError
 
 TILE = 8  # output channels
 CHUNK_BYTES = 64  # of a channel: the part of the reduction of which a lane has 16 bytes

@@ -9,7 +9,6 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from turbopi.errors import BackendUnavailable
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
@@ -17,6 +16,7 @@ from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention.suffix_tile import FewTile, Tile, tiles
 from turbopi.kernels.sm90.instructions import DependentKernel
+from turbopi.support.errors import BackendUnavailable
 
 PARAMETERS = Parameters(
     (

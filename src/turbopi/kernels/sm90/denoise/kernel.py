@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
 from turbopi.kernels.interface import KeptStep, State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
@@ -31,6 +30,7 @@ from turbopi.kernels.sm90.denoise.packing import (
     Tables,
     most,
 )
+from turbopi.support.errors import BackendError, BackendUnavailable
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 # Of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"; {observations}:

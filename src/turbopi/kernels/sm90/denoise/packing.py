@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.denoise.packing import KINDS as KINDS
 from turbopi.kernels.portable.denoise.packing import matrix_shapes
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.fp8 import E4M3, Directions
+from turbopi.support.errors import BackendError
 
 BLOCK = 16  # rows of a tile, columns of a block
 WARPS = 16  # that multiply

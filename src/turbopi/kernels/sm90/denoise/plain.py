@@ -9,8 +9,8 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.kernels.interface import GemmaLayer, KeptStep, State, TokenInputs
 from turbopi.kernels.portable.denoise.host import affine
-from turbopi.model.denoise import euler_step
-from turbopi.model.layers import rope_tables
+from turbopi.models.pi0.denoise import euler_step
+from turbopi.models.pi0.layers import rope_tables
 from turbopi.quantization.fp8 import to_e4m3
 
 Operand = Callable[[Tensor, int, int], Tensor]

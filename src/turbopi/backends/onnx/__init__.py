@@ -1,0 +1,1 @@
+"""ONNX, whole: the export, and the backend that runs it."""

@@ -1,0 +1,66 @@
+"""What a policy will offer, told from its configuration and backend before minutes of loading its weights."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from turbopi.config import typed_grid
+from turbopi.serve.options import ServerOptions
+from turbopi.support.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
+    from turbopi.cli.options import PolicyOptions
+    from turbopi.realtime.running_chunk import JoinMode
+
+
+@dataclass(frozen=True)
+class Offers:
+    """`UnifiedPolicy`'s attributes of these names, and its metadata's `real_time`."""
+
+    real_time: Mapping[str, Any]
+    pipelined: bool
+    batch_modes: "tuple[JoinMode, ...]"
+
+
+def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
+    """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
+    from turbopi import backends
+    from turbopi.backends.abilities import Abilities
+    from turbopi.policy.call_options import Denoising
+    from turbopi.policy.chunk_conditioning import Joining
+
+    fitting = options.for_checkpoint(checkpoint)
+    device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
+    name = backends.choose(device, precision)[0] if fitting.backend == "auto" else fitting.backend  # type: ignore[arg-type]
+    backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
+    kind: Any = backends.class_of(name)  # a class has its instances' capabilities
+    asked = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
+    no_pipeline: Any = None  # no observation is read
+    modes = Joining(checkpoint.config, no_pipeline, Abilities(kind), asked.integration).modes
+    batches = isinstance(kind, backends.RunsBatches) and (asked.integration is None or asked.integration.is_euler)
+    return Offers(
+        real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},
+        pipelined=isinstance(kind, backends.Submits),
+        batch_modes=modes if batches else (),
+    )
+
+
+def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "Checkpoint") -> None:
+    """Raise ConfigError for options of a server that the policy won't be able to follow."""
+    if server.execution is None and server.execution_horizon is None and server.max_batch is None:
+        return
+    from turbopi.serve.calls import largest_batch
+    from turbopi.serve.real_time import check_execution
+
+    offers = offers_of(options, checkpoint)
+    check_execution(server, offers.real_time, checkpoint.config.model.action_horizon)
+    largest_batch(server, pipelined=offers.pipelined, batch_modes=offers.batch_modes)
+
+
+def check_warmup(warmup: bool, strict: bool, max_batch: int | None) -> None:
+    """Raise ConfigError for what needs the warm-up."""
+    if strict and not warmup:
+        raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
+    if max_batch is not None and max_batch > 1 and not warmup:
+        raise ConfigError(f"--max-batch {max_batch} needs the warm-up, which measures batches: leave out --no-warmup")

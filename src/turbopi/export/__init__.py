@@ -1,1 +1,0 @@
-"""The model in formats that other runtimes read."""

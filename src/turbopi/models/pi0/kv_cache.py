@@ -1,0 +1,75 @@
+"""What denoising needs to know of an observation: the prefix's keys and values in every layer."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from turbopi.models.observation import Observation
+
+
+@dataclass(frozen=True)
+class PrefixLayout:
+    """Which of the padded prefix's slots (256 a camera, then the prompt) are computed.
+
+    `columns` None: all of them, and `mask` says which may be attended to. Otherwise only the slots that some batch
+    row needs, and `mask` is None if every row needs them all: always so for B = 1. This compaction is exact,
+    because a masked slot takes no position and nothing attends to it.
+    """
+
+    pad_mask: Tensor  # bool[B, S_padded]  valid slots
+    positions: Tensor  # int64[B, S_padded]  RoPE positions: count of valid slots so far, minus 1
+    columns: Tensor | None  # int64[S]  the slots that are computed
+    mask: Tensor | None  # bool[B, S]  which of the computed slots are valid; None: all
+
+    @classmethod
+    def of(cls, observation: Observation, tokens_per_image: int, *, compact: bool) -> "PrefixLayout":
+        """The layout of an observation; reading the masks waits for the device."""
+        pad_mask = torch.cat(
+            (observation.image_mask.repeat_interleave(tokens_per_image, dim=1), observation.token_mask), dim=1
+        )
+        positions = pad_mask.cumsum(1) - 1
+        if not compact:
+            return cls(pad_mask, positions, None, pad_mask)
+        columns = pad_mask.any(0).nonzero().squeeze(1)
+        mask = pad_mask[:, columns]
+        return cls(pad_mask, positions, columns, None if bool(mask.all()) else mask)
+
+    @property
+    def computed_positions(self) -> Tensor:
+        """int64[B, S]: positions of the computed slots."""
+        return self.positions if self.columns is None else self.positions[:, self.columns]
+
+    def to_padded(self, x: Tensor, dim: int) -> Tensor:
+        """Put the computed slots of x, along `dim`, back into the padded prefix; slots not computed are 0."""
+        if self.columns is None:
+            return x
+        padded = x.new_zeros((*x.shape[:dim], self.pad_mask.shape[1], *x.shape[dim + 1 :]))
+        return padded.index_copy_(dim, self.columns, x)
+
+
+@dataclass(frozen=True)
+class EmbeddedPrefix:
+    """An observation as it enters the language model."""
+
+    embs: Tensor  # [B, S, D]  the layout's slots
+    layout: PrefixLayout
+    lengths: Tensor  # int64[B]  valid prefix tokens
+    state: Tensor  # float32[B, action_dim]
+
+
+@dataclass(frozen=True)
+class KVCache:
+    """Keys (after RoPE) and values of the prefix. The suffix never appends: it computes its own in every step."""
+
+    k: Tensor  # [layer, B, G, S, K]
+    v: Tensor  # [layer, B, G, S, K]
+    mask: Tensor | None  # bool[B, S]; None: every slot is valid
+    lengths: Tensor  # int64[B]  valid prefix tokens; the suffix's positions go on from here
+    state: Tensor  # float32[B, action_dim]  Pi0's suffix starts with it; Pi0.5 ignores it
+
+    def row(self, row: int) -> "KVCache":
+        """One observation's alone, masked as before."""
+        one = slice(row, row + 1)
+        mask = None if self.mask is None else self.mask[one]
+        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one])

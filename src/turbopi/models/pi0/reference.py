@@ -1,0 +1,340 @@
+"""The reference: Pi0.5 and Pi0 in plain PyTorch, exact to openpi. Every backend is judged against it.
+
+    prefix(observation) -> KVCache      SigLIP and the language model, once an observation
+    denoise(cache, noise, N) -> actions the action expert, N times
+    sample(observation, noise, N)       both
+
+`conditioning` adds what real-time execution needs (conditioning.py). Actions after every single step, for whoever
+streams them, are the trace's x_t: x_t[k] is x after k steps.
+
+Intermediates go into a `trace` dict under the names, and in the layouts, that golden files use; see `Trace`.
+Precisions: float32 (the oracle), and bfloat16 as openpi serves it, except that RoPE stays float32 (as in openpi's JAX).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from turbopi.config import ModelConfig
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, of_rows
+from turbopi.models.pi0.denoise import Pull, guided_velocity, run_expert, suffix_mask, suffix_rope, time_embedding
+from turbopi.models.pi0.exact import exact_float32
+from turbopi.models.pi0.gemma import Gemma
+from turbopi.models.pi0.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
+from turbopi.models.pi0.layers import rope_tables
+from turbopi.models.pi0.prefix import camera_slots, embed_images, embed_prompt, prefix_keys_values
+from turbopi.models.pi0.vision import VisionTower
+from turbopi.support.errors import ObservationError
+
+FloatPrecision = Literal["bf16", "f32"]
+
+# Names of what a trace records. N steps, B batch, S padded prefix slots, C cameras, H horizon, L layers.
+#   prefix_embs [B, S, D]   prefix_pad_mask bool[B, S]   prefix_positions int[B, S]   vision_last_hidden [C, B, 256, W]
+#   kv_k, kv_v [L, B, S, G, K]   times [N]   cond [N, B, D]   x_t [N + 1, B, H, 32]   suffix_out [N, B, H, D]
+#   v_t [N, B, H, 32]   expert_hidden_step0 [L, B, H (Pi0: H + 1), D]   actions [B, H, 32]
+# Conditioned: times [N, B, H]   cond [N, B, H, D], and v_t is the guided one, which was integrated.
+Trace = dict[str, Tensor]
+
+_FLOAT32_ALWAYS = (
+    "vision.patch_embedding.",
+    "vision.position_embedding.",
+    "action_",
+    "time_mlp_",
+    "state_proj.",
+    "vlm.norm.",
+    "expert.norm.",
+)
+
+
+class Pi0Model(nn.Module):
+    """Pi0.5 or Pi0, by `config.kind`. Build it on the meta device and load a checkpoint's tensors into it."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, dim = config.expert.width, config.action_dim
+        self.vision = VisionTower(config.vision)
+        self.projector = nn.Linear(config.vision.width, config.vlm.width)
+        self.vlm = Gemma(config, config.vlm, vocab_size=config.vocab_size, adaptive=False)
+        self.expert = Gemma(config, config.expert, vocab_size=None, adaptive=config.kind == "pi05")
+        self.action_in_proj = nn.Linear(dim, width)
+        self.action_out_proj = nn.Linear(width, dim)
+        if config.kind == "pi05":
+            self.time_mlp_in = nn.Linear(width, width)
+            self.time_mlp_out = nn.Linear(width, width)
+        else:
+            self.state_proj = nn.Linear(dim, width)
+            self.action_time_mlp_in = nn.Linear(2 * width, width)
+            self.action_time_mlp_out = nn.Linear(width, width)
+        self.requires_grad_(False)
+
+    @classmethod
+    def from_state(cls, config: ModelConfig, state: dict[str, Tensor]) -> "Pi0Model":
+        """The model around tensors that are already on their device, in `parameter_dtype`s; they aren't copied."""
+        with torch.device("meta"):
+            model = cls(config)
+        model.load_state_dict(state, strict=True, assign=True)
+        return model.eval().requires_grad_(False)
+
+    @property
+    def device(self) -> torch.device:
+        return self.action_in_proj.weight.device
+
+    @property
+    def compute_dtype(self) -> torch.dtype:
+        """What activations are made of; a few parameters stay float32 (see parameter_dtype)."""
+        return self.projector.weight.dtype
+
+    # -- the two halves ----------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    @exact_float32()
+    def sample(
+        self,
+        observation: Observation,
+        noise: Tensor,
+        num_steps: int,
+        *,
+        compact: bool = True,
+        conditioning: Conditionings = None,
+        trace: Trace | None = None,
+    ) -> Tensor:
+        """Actions float32[B, H, action_dim], normalised, from noise of that shape: deterministic for given noise."""
+        cache = self.prefix(observation, compact=compact, trace=trace)
+        return self.denoise(cache, noise, num_steps, conditioning=conditioning, trace=trace)
+
+    @torch.no_grad()
+    @exact_float32()
+    def prefix(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> KVCache:
+        """Keys and values of an observation: `embed`, then `keys_values`.
+
+        compact=True computes only the slots that some batch row needs (for B = 1: no masked camera and no padding);
+        compact=False computes all S slots under a mask. Both give the same actions.
+
+        Raises ObservationError if a row has no valid camera and no valid prompt token.
+        """
+        return self.keys_values(self.embed(observation, compact=compact, trace=trace), trace=trace)
+
+    @torch.no_grad()
+    @exact_float32()
+    def denoise(
+        self,
+        cache: KVCache,
+        noise: Tensor,
+        num_steps: int,
+        *,
+        conditioning: Conditionings = None,
+        trace: Trace | None = None,
+    ) -> Tensor:
+        """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps.
+
+        num_steps     of a conditioning with another solver: evaluations of the action expert
+        conditioning  of all rows, or a list with one, or None, for each: then rows are computed one by one. None, and
+                      whatever asks for nothing beside openpi's loop, gives its results to the last bit
+
+        Raises ObservationError for a conditioning that doesn't fit.
+        """
+        if isinstance(conditioning, Sequence):
+            return self._denoise_rows(cache, noise, num_steps, conditioning, trace)
+        config, horizon = self.config, noise.shape[1]
+        asked = conditioning or Conditioning()
+        asked.check(num_steps, horizon, config.action_dim)
+        tokens, guidance = asked.token_times(num_steps, horizon, config.time_grid), asked.guidance
+        distinct = tokens.distinct()
+        rows = tokens.rows(distinct)
+        time_embs = time_embedding(distinct, config.expert.width).to(noise.device)  # [U, D]
+        conds = self.time_condition(time_embs) if config.kind == "pi05" else time_embs
+        suffix_len = horizon + (config.kind == "pi0")  # Pi0's state token comes first
+        rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
+        mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
+
+        def on_device(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(noise.device)
+
+        solver = None if asked.integration is None or asked.integration.is_euler else asked.integration
+        x_t, steps = noise, []
+        if asked.held is not None and asked.values is not None:
+            x_t = torch.where(on_device(asked.held)[:, None], on_device(asked.values), noise)
+        by_row = on_device(rows)
+        times, dt = on_device(tokens.times)[..., None], on_device(tokens.steps)[..., None]  # [N, H, 1]
+        hidden: list[Tensor] = []
+        for i in range(num_steps):
+            one_time = bool((rows[i] == rows[i, 0]).all())
+            time = conds[rows[i, 0]][None] if one_time else conds[by_row[i]][None]  # [1, D] or [1, H, D]
+            record = hidden if trace is not None and i == 0 else None
+
+            def velocity(x: Tensor, time: Tensor = time, record: list[Tensor] | None = record) -> tuple[Tensor, Tensor]:
+                return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
+
+            if guidance is None:
+                suffix_out, v_t = velocity(x_t)
+            else:
+                pull = Pull(
+                    on_device(guidance.target),
+                    on_device(guidance.weights)[:, None],
+                    on_device(guidance.strength[i])[:, None],
+                    times[i],
+                    guidance.mode == "jacobian",
+                )
+                suffix_out, v_t = guided_velocity(velocity, x_t, pull)
+            if trace is not None or solver is not None:
+                steps.append((x_t, suffix_out, v_t))
+            if solver is None:
+                x_t = x_t + dt[i] * v_t
+            else:
+                x_t = solver.next_x(i, [x for x, _, _ in steps], [v for _, _, v in steps])
+
+        if trace is not None:
+            batch = noise.shape[0]
+            if conditioning is None:
+                trace["times"] = times[:, 0, 0].cpu()
+            else:
+                trace["times"] = times[:, None, :, 0].expand(-1, batch, -1).cpu()
+            if config.kind == "pi05":
+                cond = conds[by_row[:, 0]][:, None] if conditioning is None else conds[by_row][:, None]
+                trace["cond"] = cond.expand(-1, batch, *cond.shape[2:])
+            trace["x_t"] = torch.stack([x for x, _, _ in steps] + [x_t])
+            trace["suffix_out"] = torch.stack([out for _, out, _ in steps])
+            trace["v_t"] = torch.stack([v for _, _, v in steps])
+            if hidden:
+                trace["expert_hidden_step0"] = torch.stack([layer.detach() for layer in hidden])
+            trace["actions"] = x_t
+        return x_t
+
+    def _denoise_rows(
+        self,
+        cache: KVCache,
+        noise: Tensor,
+        num_steps: int,
+        conditioning: Sequence[Conditioning | None],
+        trace: Trace | None,
+    ) -> Tensor:
+        """Each row of a batch with a conditioning of its own."""
+        traces: list[Trace] = []
+        for row, asked in enumerate(of_rows(conditioning, noise.shape[0])):
+            traces.append({})
+            one = Conditioning() if asked is None else asked  # so that all rows' traces have the same shapes
+            self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=traces[-1])
+        joined = {
+            name: torch.cat([one[name] for one in traces], dim=int(name != "actions"))
+            for name in (traces[0] if trace is not None else ["actions"])
+        }
+        if trace is not None:
+            trace.update(joined)
+        return joined["actions"]
+
+    # -- their parts: each one is a stage that a backend may time, compile or replace ----------------------------------
+
+    @torch.no_grad()
+    @exact_float32()
+    def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
+        """Pictures and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
+        per_image = self.config.vision.num_tokens
+        layout = PrefixLayout.of(observation, per_image, compact=compact)
+        lengths = layout.pad_mask.sum(1)
+        if not bool((lengths > 0).all()):
+            raise ObservationError("an observation without any valid camera or prompt token has nothing to attend to")
+        cameras = camera_slots(observation, compact=compact)
+        images = observation.images if cameras is None else observation.images[:, cameras]
+        image_embs, hidden = self.embed_images(images)
+        if cameras is not None:  # back to their slots, from which the layout selects
+            count = observation.image_mask.shape[1]
+            slots = (cameras[:, None] * per_image + torch.arange(per_image, device=cameras.device)).flatten()
+            image_embs = _scatter(image_embs, 1, slots, count * per_image)
+            hidden = _scatter(hidden, 0, cameras, count)
+        embs = torch.cat((image_embs, embed_prompt(self.vlm, observation.tokens)), dim=1)
+        embs = embs if layout.columns is None else embs[:, layout.columns]
+        if trace is not None:
+            trace["vision_last_hidden"] = hidden
+            trace["prefix_embs"] = layout.to_padded(embs, 1)
+            trace["prefix_pad_mask"] = layout.pad_mask
+            trace["prefix_positions"] = layout.positions
+        return EmbeddedPrefix(embs, layout, lengths, observation.state)
+
+    @torch.no_grad()
+    @exact_float32()
+    def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
+        """Run the language model over embedded tokens and keep every layer's keys and values."""
+        layout = embedded.layout
+        mask = None if layout.mask is None else layout.mask[:, None, None, :]
+        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, mask)
+        if trace is not None:
+            trace["kv_k"] = layout.to_padded(k, 3).transpose(2, 3)
+            trace["kv_v"] = layout.to_padded(v, 3).transpose(2, 3)
+        return KVCache(k, v, layout.mask, embedded.lengths, embedded.state)
+
+    def embed_images(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Pictures [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W])"""
+        return embed_images(self.vision, self.projector, images)
+
+    def encode_prefix(self, embs: Tensor, positions: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Embeddings [B, S, D] at int positions [B, S] -> K (rotated), V [layer, B, G, S, K]"""
+        rope = rope_tables(positions, self.config.vlm.head_dim, self.config.rope_base)
+        return prefix_keys_values(self.vlm, embs, rope, mask)
+
+    def velocity(
+        self,
+        x_t: Tensor,
+        state: Tensor,
+        time: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        rope: tuple[Tensor, Tensor],
+        mask: Tensor | None,
+        hidden: list[Tensor] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """One evaluation of the action expert -> (its output float32[B, H, D], v_t float32[B, H, action_dim]).
+
+        `time` float32[1, D], or [1, H, D] by action, is the adaRMS condition (Pi0.5) or the time embedding (Pi0).
+        """
+        adaptive = self.config.kind == "pi05"
+        tokens = self.embed_suffix(x_t, state, time)
+        out = run_expert(self.expert, tokens, time if adaptive else None, cache_k, cache_v, rope, mask, hidden)
+        suffix_out = out[:, -x_t.shape[1] :].float()
+        return suffix_out, self.action_out_proj(suffix_out)
+
+    def time_condition(self, time_embs: Tensor) -> Tensor:
+        """Pi0.5: adaRMS conditions float32[N, D]. They depend on the step alone."""
+        return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(time_embs))))
+
+    def embed_suffix(self, x_t: Tensor, state: Tensor, time_emb: Tensor) -> Tensor:
+        """Suffix tokens in the compute dtype: H actions (Pi0.5), or the state and H actions mixed with t (Pi0)."""
+        actions = self.action_in_proj(x_t)
+        if self.config.kind == "pi05":
+            return actions.to(self.compute_dtype)
+        mixed = torch.cat((actions, time_emb.expand_as(actions)), dim=-1)
+        actions = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
+        return torch.cat((self.state_proj(state)[:, None], actions), dim=1).to(self.compute_dtype)
+
+
+def _scatter(x: Tensor, dim: int, index: Tensor, size: int) -> Tensor:
+    """Zeros of `size` along `dim`, with x at `index`."""
+    out = x.new_zeros((*x.shape[:dim], size, *x.shape[dim + 1 :]))
+    return out.index_copy_(dim, index, x)
+
+
+def parameter_dtype(name: str, precision: FloatPrecision) -> torch.dtype:
+    """The dtype of a parameter (canonical name) in a precision.
+
+    bf16 follows openpi's PyTorch: patch and position embeddings, all Gemma norms with the adaRMS matrices, and the
+    action, time and state projections stay float32. SigLIP's LayerNorms are bfloat16.
+    """
+    if precision == "f32":
+        return torch.float32
+    is_gemma_norm = not name.startswith("vision.") and (
+        ".input_layernorm." in name or ".post_attention_layernorm." in name
+    )
+    return torch.float32 if is_gemma_norm or name.startswith(_FLOAT32_ALWAYS) else torch.bfloat16
+
+
+def parameter_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Canonical name -> shape of every parameter of a model."""
+    with torch.device("meta"):
+        model = Pi0Model(dataclasses.replace(config))
+    return {name: tuple(parameter.shape) for name, parameter in model.state_dict().items()}

@@ -1,0 +1,258 @@
+"""What a policy's calls may join, checked and turned into what the denoising loop is asked for (docs/real_time.md)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from turbopi.backends.abilities import Abilities
+from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.engine.conditioned import batch_form
+from turbopi.models.pi0.conditioning import (
+    Conditioning,
+    Form,
+    Guidance,
+    TokenTimes,
+    guidance_strength,
+    row_named,
+)
+from turbopi.models.pi0.solvers import Integration
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.realtime.running_chunk import FORMS, JoinMode, RunningChunk
+from turbopi.support.errors import ConfigError, ObservationError
+
+Loop = tuple[int, int]  # denoising steps, action horizon
+Row = tuple[Conditioning | None, RunningChunk | None]  # of one observation, checked: at most one of the two
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Joins:
+    """What the observations of a call are to join, checked, and how the call denoises."""
+
+    rows: Sequence[Row]
+    steps: int
+    horizon: int
+    integration: Integration | None = None
+
+    @property
+    def forms(self) -> list[Form]:
+        """What each observation's denoising loop must be able to do, as far as a batch is concerned."""
+        return [self._form(*row) for row in self.rows]
+
+    def _form(self, conditioning: Conditioning | None, chunk: RunningChunk | None) -> Form:
+        if chunk is None:
+            return batch_form(conditioning)
+        if chunk.mode == "rtc_trained" and chunk.delay == 0:  # nothing is held
+            return batch_form(integrated(None, self.integration))
+        return FORMS[chunk.mode]
+
+
+class Joining:
+    """Of one policy; `able` is its backend, `integration` how it denoises unless a call says otherwise.
+
+    Raises ConfigError for an integration that the backend doesn't have.
+    """
+
+    def __init__(
+        self,
+        config: PolicyConfig,
+        pipeline: Pipeline,
+        able: Abilities,
+        integration: Integration | None = None,
+    ) -> None:
+        self._config, self._model, self._pipeline, self._able = config, config.model, pipeline, able
+        self._integration = integration
+        if integration is not None:
+            try:
+                self._check_form("solver")
+            except ObservationError as error:
+                raise ConfigError(str(error)) from None
+
+    @property
+    def modes(self) -> tuple[JoinMode, ...]:
+        """What `RunningChunk`s may ask of this policy."""
+        if self._integration is not None and not self._integration.is_euler:
+            return ()  # see `Conditioning`
+        able = self._able.forms
+        trained = self._config.real_time.trained_max_delay > 0
+        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
+
+    def checked(
+        self,
+        conditionings: Sequence[Conditioning | None],
+        previous: Sequence[RunningChunk | None],
+        steps: int,
+        horizon: int,
+        integration: Integration | None = None,
+    ) -> Joins:
+        """What each observation of a call is to join, and how it is integrated.
+
+        Raises ObservationError; of several observations it names the row.
+        """
+        rows = [self._checked(None, None, steps, horizon, integration)] * len(conditionings)
+        for i, (conditioning, chunk) in enumerate(zip(conditionings, previous, strict=True)):
+            if conditioning is not None or chunk is not None:
+                with row_named(i, len(conditionings)):
+                    rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
+        return Joins(rows, steps, horizon, integration)
+
+    def _checked(
+        self,
+        conditioning: Conditioning | None,
+        previous: RunningChunk | None,
+        steps: int,
+        horizon: int,
+        integration: Integration | None = None,
+    ) -> Row:
+        if conditioning is not None and previous is not None:
+            raise ObservationError("conditioning and previous were both given; give one of them")
+        if previous is None:
+            conditioning = integrated(conditioning, integration)
+        elif integration is not None and not integration.is_euler:
+            raise ObservationError(
+                f"a running chunk and solver {integration.solver!r} were both given: chunks join by Euler's steps, so "
+                "take solver 'euler', whose time grid may be any, or leave out previous"
+            )
+        if conditioning is not None:
+            conditioning.check(steps, horizon, self._model.action_dim)
+            self._check_form(conditioning.form)
+        if previous is not None:
+            relative, options = self._pipeline.robot.delta_mask is not None, self._config.real_time
+            if previous.mode == "rtc_identity" and options.execution_horizon is not None:
+                end = self._model.action_horizon - options.execution_horizon  # LeRobot's, whatever the call's horizon
+                options = replace(options, execution_horizon=horizon - end if end < horizon else None)
+            previous = previous.completed(horizon, self._model.action_dim, relative=relative, options=options)
+            self._check_form(FORMS[previous.mode])
+        return conditioning, previous
+
+    def arguments(self, joins: Joins, states: Sequence[np.ndarray]) -> dict[str, Any]:
+        """What the backend is given beside the noise, once the new states are known. Raises ObservationError.
+
+        {} for an ordinary call, else "conditioning": one for all observations, or a list with one for each.
+        """
+        rows: list[Conditioning | None] = []
+        for i, ((one, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+            if chunk is not None:
+                with row_named(i, len(states)):
+                    one = self._of_chunk(chunk, state, joins)
+            rows.append(None if one is None or one.form == "plain" else one)
+        if all(one is rows[0] for one in rows):
+            return {} if rows[0] is None else {"conditioning": rows[0]}
+        return {"conditioning": rows}
+
+    def _of_chunk(self, chunk: RunningChunk, state: np.ndarray, joins: Joins) -> Conditioning:
+        steps, horizon, integration = joins.steps, joins.horizon, joins.integration
+        left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+        conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
+        if integration is not None:
+            conditioning = replace(conditioning, integration=integration)
+            if (pull := conditioning.guidance) is not None and chunk.max_guidance_weight is not None:
+                times = TokenTimes.integrated(integration, horizon).times
+                strength = guidance_strength(times, chunk.max_guidance_weight)
+                conditioning = replace(conditioning, guidance=replace(pull, strength=strength))
+        return conditioning
+
+    def to_warm(
+        self,
+        loops: Sequence[Loop],
+        modes: JoinMode | Sequence[JoinMode],
+        others: Sequence[Conditioning],
+        num_steps: int,
+        integrations: Callable[[int], Integration | None],
+    ) -> list[tuple[int, int, Conditioning | None]]:
+        """Steps, horizon and an example of every loop that a warm-up is to cover, or None. Raises ConfigError.
+
+        num_steps     of those of `others` that don't say
+        integrations  of so many steps
+        """
+        asked: list[tuple[int, int, Conditioning | None]] = [
+            (*loop, integrated(None, integrations(loop[0]))) for loop in loops
+        ]
+        for mode in [modes] if isinstance(modes, str) else modes:
+            if mode not in self.modes:
+                raise ConfigError(
+                    f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
+                )
+            for loop in loops:
+                asked.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
+        for one in others:
+            steps, horizon = one.size(num_steps, self._model.action_horizon)
+            try:
+                if one.tokens is None and one.integration is None:
+                    one = integrated(one, integrations(steps)) or one
+                one.check(steps, horizon, self._model.action_dim)
+                self._check_form(one.form)
+            except ObservationError as error:
+                raise ConfigError(f"warm-up: {error}") from None
+            asked.append((steps, horizon, one))
+        return asked
+
+    def _check_form(self, form: Form) -> None:
+        if form != "plain" and form not in self._able.forms:
+            backend = self._able.backend
+            what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+            if form == "solver":
+                raise ObservationError(
+                    f"backend {backend.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
+                    "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
+                )
+            raise ObservationError(
+                f"backend {backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
+                "leave out conditioning and previous"
+            )
+
+
+def integrated(conditioning: Conditioning | None, integration: Integration | None) -> Conditioning | None:
+    """A conditioning, or none, with how it is integrated. Raises ObservationError for two that say so."""
+    if integration is None:
+        return conditioning
+    if conditioning is None:
+        return Conditioning(integration=integration)
+    if conditioning.tokens is not None or conditioning.integration is not None:
+        raise ObservationError(
+            f"the conditioning has times of its own, and this call's solver and time grid say {integration}: leave out "
+            "one of them, or give solver 'euler' and time grid 'uniform' for this call"
+        )
+    return replace(conditioning, integration=integration)
+
+
+def of_each(what: str, given: Sequence[T | None] | None, rows: int, kind: type[T]) -> list[T | None]:
+    """An argument of a batch: one for each observation, or None. Raises ObservationError for anything else."""
+    if given is None:
+        return [None] * rows
+    if not isinstance(given, Sequence) or isinstance(given, str | Mapping):
+        raise ObservationError(
+            f"{what} is of type {type(given).__name__}; for a batch it should be a list of a {kind.__name__}, or None, "
+            "for each observation"
+        )
+    if len(given) != rows:
+        raise ObservationError(
+            f"{what} has {len(given)} entries for {rows} observations; it should have one for each: a "
+            f"{kind.__name__}, or None"
+        )
+    for row, one in enumerate(given):
+        if one is not None and not isinstance(one, kind):
+            with row_named(row, rows):
+                raise ObservationError(
+                    f"its {what} is of type {type(one).__name__}; it should be a {kind.__name__}, or None"
+                )
+    return list(given)
+
+
+def flags(what: str, given: bool | Sequence[bool], rows: int) -> list[bool]:
+    """An argument of a batch: for all of its observations, or for each. Raises ObservationError."""
+    each: Any = [given] * rows if isinstance(given, bool) else given
+    if not isinstance(each, Sequence) or len(each) != rows or not all(isinstance(one, bool) for one in each):
+        raise ObservationError(f"{what} is {given!r:.100}; it should be true or false, or a list of {rows} of these")
+    return list(each)
+
+
+def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:
+    """A conditioning of a form, for a warm-up."""
+    nothing = np.zeros((horizon, model.action_dim), np.float32)
+    if form == "tokens":
+        return Conditioning(held=np.arange(horizon) < 1, values=nothing)
+    weights, strength = np.zeros(horizon, np.float32), np.zeros((num_steps, horizon), np.float32)
+    return Conditioning(guidance=Guidance(nothing, weights, strength))

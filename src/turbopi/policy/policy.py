@@ -1,0 +1,476 @@
+"""The whole policy on one screen: preprocess → backend → postprocess."""
+
+import dataclasses
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbopi import backends
+from turbopi.backends import Precision
+from turbopi.backends.abilities import Abilities
+from turbopi.backends.device_lost import Guard
+from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.checkpoint.base import Room
+from turbopi.checkpoint.calibration import for_policy
+from turbopi.config import PolicyConfig, Solver, TimeGrid
+from turbopi.models.observation import ModelInputs, Observation, with_cameras
+from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.reference import FloatPrecision
+from turbopi.policy.call_options import (
+    Denoising,
+    Numbers,
+    checked_batch,
+    checked_cameras,
+    checked_horizon,
+    checked_steps,
+    noise_for,
+    several,
+    warm_loops,
+)
+from turbopi.policy.chunk_conditioning import Joining, flags, of_each
+from turbopi.policy.model_call import ModelCall
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.quantization.calibration_file import Quantization
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.robots import Robot
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
+
+logger = logging.getLogger(__name__)
+
+
+class UnifiedPolicy:
+    """A Pi0.5 or Pi0 policy over any backend: observation in, action chunk out, as openpi computes it.
+
+        policy = UnifiedPolicy("checkpoints/pi05_libero", config="pi05_libero")
+        actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
+
+    Args:
+        checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or a `Checkpoint` that is open already.
+        config: what no checkpoint records (robot, statistics, horizon, …): a preset's name, a .json, a PolicyConfig, or
+            "auto" for LeRobot's own config or the `turbopi.json` beside the weights.
+        backend: a name from `turbopi backends`; "auto" takes the fastest one available and says which in `metadata`.
+        precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
+            (docs/quantization.md).
+        quantization: what `turbopi calibrate` wrote for this checkpoint, for these precisions alone. None: the
+            `turbopi_fp8.json` or `turbopi_int8.json` beside the weights.
+        num_denoising_steps: evaluations of the action expert in a call, unless `infer` is told otherwise. None: the
+            config's, which has them from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
+        solver: "euler", as openpi, "midpoint", "heun", "ab2" or "exponential": docs/performance.md. None: the config's.
+        time_grid: "uniform", as openpi, "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1
+            (noise) to 0, which bring their number of steps. None: the config's.
+        device: "auto", "cpu", "cuda" or "cuda:N".
+        tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
+            the checkpoint folder or in openpi's cache.
+        default_prompt: the instruction for observations that bring none.
+        robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
+        progress: show a bar while the weights load.
+        strict: refuse, with an ObservationError, a call that warm-up didn't cover and the backend would capture or
+            compile for, which takes from a second to a minute in the middle of a robot's motion. See `warmup`.
+
+    Raises ConfigError, CheckpointError, CalibrationError, TokenizerError or BackendUnavailable, each with what to do
+    about it.
+    Calls from several threads are served one at a time.
+    """
+
+    def __init__(
+        self,
+        checkpoint_dir: str | Path | Checkpoint,
+        *,
+        config: str | Path | PolicyConfig = "auto",
+        backend: str = "auto",
+        precision: Precision = "bf16",
+        quantization: str | Path | Quantization | None = None,
+        num_denoising_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
+        device: str | torch.device = "auto",
+        tokenizer: Any = None,
+        default_prompt: str | None = None,
+        robot: str | Robot | None = None,
+        progress: bool = False,
+        strict: bool = False,
+    ) -> None:
+        if num_denoising_steps is not None:
+            checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
+        self._device = backends.resolve_device(device)
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
+        backends.check(name, self._device, precision)  # before a calibration is asked for, and weights are read
+
+        checkpoint = (
+            checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
+        )
+        if checkpoint.format == "random" and tokenizer is None:
+            tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
+        self.config = checkpoint.config
+        self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
+        prompt_tokenizer = load_tokenizer(
+            tokenizer,
+            checkpoint_dir=checkpoint.path,
+            named=checkpoint.named_tokenizer,
+            candidates=checkpoint.tokenizer_candidates,
+            vocab_size=checkpoint.config.model.vocab_size,
+        )
+        self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
+        of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes
+        for note in (*of_weights, *self._pipeline.notes):
+            logger.warning("%s", note)
+        self._loading: dict[str, Any] = {}
+
+        def load(to: torch.device | Room, in_precision: FloatPrecision) -> dict[str, torch.Tensor]:
+            loaded = checkpoint.load(to, in_precision, progress=progress)
+            self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
+            return loaded.state
+
+        calibration = for_policy(quantization, precision, checkpoint)
+        self._guard = Guard(self._device)
+        with self._guard:
+            self.backend = backends.create(
+                name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
+            )
+        self.backend.strict = self._strict = strict
+        able = Abilities(self.backend)
+        self._joining = Joining(self.config, self._pipeline, able, self._denoising.integration)
+        self._call = ModelCall(self._pipeline, self._joining, able, self._guard)
+        self._generator = np.random.default_rng()
+        self._backend_reason = why
+        self._checkpoint = checkpoint
+
+    def infer(
+        self,
+        obs: Mapping[str, Any],
+        *,
+        noise: np.ndarray | None = None,
+        seed: int | None = None,
+        num_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
+        horizon: int | None = None,
+        conditioning: Conditioning | None = None,
+        previous: RunningChunk | None = None,
+        model_actions: bool = False,
+    ) -> dict[str, Any]:
+        """One observation to one action chunk.
+
+        Args:
+            obs: the observation under the robot's own keys (docs/robots.md), on the host, without a batch axis.
+            noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. Given noise, or a seed, makes the result
+                deterministic.
+            seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
+            num_steps, solver, time_grid: for this call alone, as the policy's `num_denoising_steps` and so on.
+            horizon: actions of the chunk, H, for this call alone. None: the config's, which the weights were trained
+                for and openpi has no other than. All actions of a chunk attend to each other, so a shorter chunk isn't
+                the beginning of a longer one. Backends with engines for one horizon refuse another.
+            previous: the chunk that the robot is carrying out, which this one is to join (docs/real_time.md). What can
+                be asked for is in `metadata["real_time"]`.
+            conditioning: instead of `previous`, what exactly the denoising loop is to do (models/pi0/conditioning.py).
+                One with times or a solver of its own brings its number of steps.
+            model_actions: also return what a later call's `previous` needs, see below.
+
+        Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
+
+            preprocess_ms    reading, resizing, tokenising, up to the model
+            queue_ms         waiting for calls of other threads
+            infer_ms         the model alone, from inputs on the host to actions on the host, as openpi counts. With a
+                             backend that starts on the pictures (`begin`), tokenising runs beside it and is in it
+            vision_ms, prefix_ms, denoise_ms
+                             stages of infer_ms on the device, where the backend can tell them apart. prefix_ms begins
+                             where vision ends: time in which the device waits for the host is in it
+            postprocess_ms   un-normalising and the robot's own outputs
+            total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
+
+        With `model_actions` also "model_actions": float32[H, action_dim], in the model's normalised space, and if the
+        policy's actions are relative to the state "anchor": float64[d], that state in their units.
+
+        Raises ObservationError for anything wrong with the arguments, naming it; ActionError if an action is NaN or
+        infinite; DeviceLost once the GPU has failed for good (`lost`).
+        """
+        noises = None if noise is None else [noise]
+        own = of_each("conditioning", [conditioning], 1, Conditioning)
+        joined = of_each("previous", [previous], 1, RunningChunk)
+        asked = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
+        return self._infer([obs], noises, seed, asked, horizon, own, joined, [model_actions])[0]
+
+    def infer_batch(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        *,
+        noise: Sequence[np.ndarray] | np.ndarray | None = None,
+        seed: int | Sequence[int] | None = None,
+        num_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
+        horizon: int | None = None,
+        conditioning: Sequence[Conditioning | None] | None = None,
+        previous: Sequence[RunningChunk | None] | None = None,
+        model_actions: bool | Sequence[bool] = False,
+    ) -> list[dict[str, Any]]:
+        """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
+
+        `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
+        number, or one for each row. `conditioning` and `previous` are lists with one for each row, or None for a row
+        that joins nothing; `model_actions` is for all rows, or a list with one for each. What is wrong with a row is
+        said with its number. All rows take the same number of denoising steps: `num_steps`, else what a row's
+        conditioning brings, else the policy's.
+
+        `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
+        splits other numbers (`backend.batch_costs`). Observations may differ in cameras, prompts and what they join:
+        rows with times, held actions or identity guidance run together with plain ones, rows guided by the true
+        Jacobian with each other. Actions then differ from what `infer` returns by as much as sums in another order do:
+        docs/performance.md. With another solver than Euler's they run one by one there.
+        """
+        rows = len(observations)
+        own = of_each("conditioning", conditioning, rows, Conditioning)
+        bringing = next((one for one in own if one is not None and one.brings_steps), None)
+        asked = self._denoising.of_call(num_steps, solver, time_grid, bringing)
+        joined, told = of_each("previous", previous, rows, RunningChunk), flags("model_actions", model_actions, rows)
+        return self._infer(observations, noise, seed, asked, horizon, own, joined, told)
+
+    def _infer(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        noise: Sequence[np.ndarray] | np.ndarray | None,
+        seed: int | Sequence[int] | None,
+        denoising: Denoising,
+        horizon: int | None,
+        conditionings: Sequence[Conditioning | None],
+        previous: Sequence[RunningChunk | None],
+        model_actions: Sequence[bool],
+    ) -> list[dict[str, Any]]:
+        """`infer_batch`; the last three have one for each observation."""
+        start = time.perf_counter()
+        self._guard.refuse_if_lost()
+        if not observations:
+            raise ObservationError("infer_batch was given no observation")
+        rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
+        joins = self._joining.checked(conditionings, previous, steps, actions, denoising.integration)
+        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
+        chunks = ran.sample.actions.numpy()
+        results = self._pipeline.after_all(chunks, ran.states)
+        for row, result in enumerate(results):
+            if model_actions[row]:
+                result["model_actions"] = chunks[row].copy()
+                if (anchor := self._pipeline.anchor(ran.states[row])) is not None:
+                    result["anchor"] = anchor
+        timing = ran.sample.timing(start, ran.asked, ran.infer_start, ran.infer_end, time.perf_counter())
+        return [result | {"policy_timing": dict(timing)} for result in results]
+
+    def submit(
+        self,
+        obs: Mapping[str, Any],
+        *,
+        noise: np.ndarray | None = None,
+        seed: int | None = None,
+        num_steps: int | None = None,
+        horizon: int | None = None,
+        serially: bool = False,
+    ) -> "Future[dict[str, Any]]":
+        """`infer` that returns at once, with a Future of what `infer` returns; several may be in flight.
+
+        For the pipelined backends, which encode one observation while another is denoised. Other backends raise
+        ConfigError, unless `serially` says that running it now, before returning, will do.
+        """
+        if not isinstance(self.backend, backends.Submits):
+            if not serially:
+                raise ConfigError(
+                    f"backend {self.backend.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
+                    "or submit(…, serially=True) to run it before submit returns"
+                )
+            done: Future[dict[str, Any]] = Future()
+            done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps, horizon=horizon))
+            return done
+        start = time.perf_counter()
+        self._guard.refuse_if_lost()
+        actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
+        inputs, state = self._pipeline.before(obs)
+        x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
+        asked = time.perf_counter()
+        with self._guard:
+            running = self.backend.submit(Observation.stack([inputs]), x_1, steps)
+        answer: Future[dict[str, Any]] = Future()
+
+        def finish(ran: "Future[backends.Sample]") -> None:
+            try:
+                try:
+                    sample = ran.result()
+                except Exception as error:
+                    self._guard.examine(error)
+                    raise
+                infer_end = time.perf_counter()
+                result = self._pipeline.after_all(sample.actions.numpy(), [state])[0]
+                infer_start = asked + sample.queue_ms / 1e3
+                timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
+                answer.set_result(result | {"policy_timing": timing})
+            except BaseException as error:
+                answer.set_exception(error)
+
+        running.add_done_callback(finish)
+        return answer
+
+    def reset(self) -> None:
+        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call knows of an earlier one."""
+
+    def warmup(
+        self,
+        *,
+        cameras: Numbers = None,
+        horizons: Numbers = None,
+        steps: Numbers = None,
+        batches: Numbers = None,
+        real_time: JoinMode | Sequence[JoinMode] = (),
+        conditioning: Sequence[Conditioning] = (),
+    ) -> float:
+        """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took.
+
+        Every prompt length is covered, for all combinations of:
+
+            cameras     numbers of cameras that observations have. None: all that the robot may send
+                        (`Robot.camera_counts`); backends whose engines take minutes to build skip those that aren't
+                        built yet, but for the example observation's
+            horizons    action horizons, see `infer`. None: the config's
+            steps       numbers of denoising steps. None: the policy's
+            batches     sizes of the batches that `infer_batch` will be given, whose observations have any of these
+                        numbers of cameras on average, and join what `real_time` and `conditioning` say, or nothing.
+                        None: none, only single observations
+            real_time   modes of `RunningChunk` that calls will have, besides calls without one
+            conditioning
+                        examples of other conditionings that they will have, each for its own steps and horizon alone:
+                        of a conditioning the form and the times count, not what is held or pulls
+
+        each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
+        engine/graph_cache.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for
+        more loops than are kept.
+        """
+        start = time.perf_counter()
+        self._guard.refuse_if_lost()
+        example = self.example_observation()
+        inputs = self._pipeline.before(example)[0]
+        own = int(inputs.image_mask.sum())
+        sent = [own, *(getattr(self._pipeline.robot, "camera_counts", None) or ())]  # the example's first
+        counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
+        sizes = several("batches", 1 if batches is None else batches, [], checked_batch)
+        loops = warm_loops(
+            several("steps", steps, [self._denoising.steps], checked_steps),
+            several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
+        )
+        of_steps = {n: self._denoising.changed(n, None, None, ConfigError).integration for n, _ in loops}
+        asked = self._joining.to_warm(loops, real_time, conditioning, self._denoising.steps, of_steps.get)
+        plan = [(count, *one) for count in counts for one in asked]
+        with self._call.lock, self._guard:
+            for i, (count, num_steps, horizon, one) in enumerate(plan):
+                seen = inputs if count == own else with_cameras(inputs, count)
+                self.backend.warmup(
+                    Observation.stack([seen]),
+                    num_steps,
+                    horizon,
+                    required=cameras is not None or count == own,
+                    last=i + 1 == len(plan),
+                    **({} if one is None else {"conditioning": one}),
+                )
+                if sizes and isinstance(self.backend, backends.RunsBatches):
+                    self.backend.warmup_batches(Observation.stack([seen]), num_steps, horizon, sizes, one)
+        if own in counts:
+            self._whole_call(example, *loops[0])
+        return time.perf_counter() - start
+
+    def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
+        try:
+            self.infer(example, seed=0, num_steps=num_steps, horizon=horizon)
+        except ActionError as error:  # of a random observation: whether the weights are at fault, real ones show
+            logger.warning("warm-up: %s", error)
+
+    def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
+        """What the model is given for an observation. Raises ObservationError if it can't be used."""
+        return self._pipeline.before(obs)[0]
+
+    def example_observation(self, seed: int = 0) -> dict[str, Any]:
+        """A random observation in this robot's keys, shapes and dtypes."""
+        return self._pipeline.example(seed)
+
+    @property
+    def lost(self) -> str | None:
+        """Why the GPU failed for good, and with it this process; None while it works.
+
+        Found out by the call that fails: it and all later ones raise DeviceLost with this reason, the later ones
+        without touching the GPU. Out of memory isn't such a failure.
+        """
+        return self._guard.lost
+
+    @property
+    def runs_batches(self) -> bool:
+        """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
+        integration = self._denoising.integration
+        return isinstance(self.backend, backends.RunsBatches) and (integration is None or integration.is_euler)
+
+    @property
+    def batch_modes(self) -> tuple[JoinMode, ...]:
+        """Modes of `RunningChunk`s with which `infer_batch` runs observations together."""
+        return self._joining.modes if self.runs_batches else ()
+
+    @property
+    def loop_arguments(self) -> dict[str, Any]:
+        """What the backend's own methods are told of this policy's solver and time grid: nothing, if they are openpi's.
+
+        For whoever calls `backend` itself, with `metadata["num_denoising_steps"]`.
+        """
+        asked = self._denoising.integration
+        return {} if asked is None else {"conditioning": Conditioning(integration=asked)}
+
+    @property
+    def pipelined(self) -> bool:
+        """Whether `submit` overlaps observations; the server uses it then."""
+        return isinstance(self.backend, backends.Submits)
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """What happens before and after the model."""
+        return self._pipeline
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What this policy is: the server sends it to every client on connection. Plain values only."""
+        model = self.config.model
+        return {
+            "config": self.config.name,
+            "model": model.kind,
+            "action_horizon": model.action_horizon,
+            **self._denoising.metadata,
+            "backend": self.backend.name,
+            "backend_reason": self._backend_reason,
+            "backend_details": self.backend.describe(),
+            "precision": self.backend.precision,
+            "strict": self._strict,
+            "device": str(self._device),
+            "device_name": torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else "CPU",
+            "checkpoint_format": self._checkpoint.format,
+            "random_weights": self._checkpoint.format == "random",
+            "tokenizer": self._pipeline.tokenizer.source,
+            "torch": torch.__version__,
+            "real_time": {"modes": list(self._joining.modes), **dataclasses.asdict(self.config.real_time)},
+            **self._loading,
+            **self._pipeline.metadata,
+        }
+
+    def _horizon(self, horizon: int | None) -> int:
+        """A call's. Raises ObservationError."""
+        own = self.config.model.action_horizon
+        return own if horizon is None else self._checked_horizon(horizon, ObservationError)
+
+    def _checked_horizon(self, horizon: int, error: type[ConfigError] | type[ObservationError]) -> int:
+        own = self.config.model.action_horizon
+        if checked_horizon(horizon, error) != own and not self.backend.any_horizon:
+            raise error(
+                f"backend {self.backend.name!r} has engines for the config's action horizon of {own}, not for "
+                f"{horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
+            )
+        return int(horizon)
+
+    def _noise(self, batch: int, horizon: int, noise: Any, seed: int | Sequence[int] | None) -> np.ndarray:
+        """float32[B, H, action_dim], given or drawn."""
+        return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)

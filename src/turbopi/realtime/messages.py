@@ -1,0 +1,219 @@
+"""What a message to a policy server says about real-time execution: optional keys beside the observation's own.
+
+docs/serving.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
+ignores them, so a client looks for "real_time" in the server's metadata first. The keys about when a request wants its
+answer (SCHEDULING_KEYS) are only named here: serve/urgency.py reads them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from turbopi.config import Schedule
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.support.errors import ObservationError
+
+PREFIX = "turbopi/"
+MAX_SESSION = 64  # characters
+MAX_STEP = 2**53
+MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
+MAX_SEED = 2**64 - 1
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")
+KEYS = (
+    *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
+    *("session", "step", "reset", "seed"),
+    *SCHEDULING_KEYS,
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a message asks for beside its observation; None and False: it doesn't say.
+
+    previous           the running chunk, if the client keeps it itself
+    model_actions      the answer shall have "model_actions", and "anchor" for relative actions
+    mode, delay, execution_horizon
+                       how to join, if the server keeps the running chunk; the latter two in control steps
+    guidance           {"schedule": …, "max_guidance_weight": …}, those of them that were given
+    session            its name; None: the connection is the session
+    step               actions that the robot has carried out in this session when the observation was taken
+    reset              a new episode: the session's running chunk is forgotten
+    seed               draws the noise of this call, as `UnifiedPolicy.infer`'s: the same request, the same answer
+    """
+
+    previous: RunningChunk | None = None
+    model_actions: bool = False
+    mode: JoinMode | None = None
+    delay: int | None = None
+    execution_horizon: int | None = None
+    guidance: Mapping[str, Any] | None = None
+    session: str | None = None
+    step: int | None = None
+    reset: bool = False
+    seed: int | None = None
+
+
+def message(
+    observation: Mapping[str, Any],
+    previous: RunningChunk | None = None,
+    model_actions: bool = False,
+    seed: int | None = None,
+) -> dict[str, Any]:
+    """The message to send: the observation, and the arguments of `UnifiedPolicy.infer` under their keys.
+
+    `read_message` is its inverse.
+    """
+    asked: dict[str, Any] = {} if seed is None else {"seed": seed}
+    if model_actions:
+        asked["model_actions"] = True
+    if previous is not None:
+        asked |= {
+            "previous": np.asarray(previous.left_over, np.float32),
+            "delay": int(previous.delay),
+            "mode": previous.mode,
+        }
+        if previous.schedule is not None:
+            asked["schedule"] = previous.schedule
+        if previous.max_guidance_weight is not None:
+            asked["max_guidance_weight"] = float(previous.max_guidance_weight)
+        if previous.execution_horizon is not None:
+            asked["execution_horizon"] = int(previous.execution_horizon)
+        if previous.anchor is not None:
+            asked["anchor"] = np.asarray(previous.anchor)
+    return {**observation, **{PREFIX + key: value for key, value in asked.items()}}
+
+
+def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
+    """The observation alone, and what was asked for beside it. Raises ObservationError for what can't be meant."""
+    observation = {key: value for key, value in received.items() if not key.startswith(PREFIX)}
+    if len(observation) == len(received):
+        return observation, Asked()
+    given = {key.removeprefix(PREFIX): value for key, value in received.items() if key.startswith(PREFIX)}
+    unknown = sorted(set(given) - set(KEYS))
+    if unknown:
+        raise ObservationError(
+            f"{PREFIX}{unknown[0]} is no key of this server; keys that begin with {PREFIX!r} are "
+            + ", ".join(PREFIX + key for key in KEYS)
+        )
+    mode = given.get("mode")
+    if mode is not None and (not isinstance(mode, str) or mode not in get_args(JoinMode)):
+        raise ObservationError(
+            f"{PREFIX}mode is {mode!r:.100}; it should be one of {', '.join(get_args(JoinMode))}, or none in a session "
+            "that joins nothing"
+        )
+    delay = _whole(given, "delay", 0)
+    horizon = _whole(given, "execution_horizon", 1)
+    guidance = _guidance(given)
+    session = given.get("session")
+    if session is not None and not (isinstance(session, str) and 0 < len(session) <= MAX_SESSION):
+        raise ObservationError(
+            f"{PREFIX}session is {session!r:.100}; it should be text of 1 to {MAX_SESSION} characters"
+        )
+    left_over = _left_over(given)
+    anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
+    previous = None
+    if left_over is not None:
+        assert delay is not None  # else `_left_over` refuses
+        previous = RunningChunk(left_over, delay, horizon, cast("JoinMode", mode), anchor, **guidance)
+    asked = Asked(
+        previous=previous,
+        model_actions=_flag(given, "model_actions"),
+        mode=cast("JoinMode | None", mode),
+        delay=delay,
+        execution_horizon=horizon,
+        guidance=guidance or None,
+        session=session,
+        step=_whole(given, "step", 0),
+        reset=_flag(given, "reset"),
+        seed=_whole(given, "seed", 0, MAX_SEED),
+    )
+    return observation, asked
+
+
+def _left_over(given: Mapping[str, Any]) -> np.ndarray | None:
+    """float32[K, A], the rows of the running chunk that the client keeps; None if it keeps none."""
+    if "previous" not in given:
+        if "anchor" in given:
+            raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
+        return None
+    left_over = _numbers(given, "previous")
+    if left_over.ndim != 2 or not len(left_over):
+        raise ObservationError(
+            f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
+            'rows of "model_actions" that are left when the observation is taken'
+        )
+    if (too_large := np.abs(left_over) > MAX_ACTION).any():
+        raise ObservationError(
+            f"{_first(left_over, too_large, 'previous')}, whose square isn't finite in float32, in which the model "
+            'computes. It should be rows of "model_actions", which are normalised: most are from -1 to 1'
+        )
+    for needed in ("mode", "delay"):
+        if given.get(needed) is None:
+            raise ObservationError(f"{PREFIX}previous came without {PREFIX}{needed}: give both mode and delay")
+    if given.get("session") is not None:
+        raise ObservationError(
+            f"{PREFIX}previous and {PREFIX}session were both given: either the client keeps the running chunk, or "
+            "the server does"
+        )
+    return left_over
+
+
+def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `RunningChunk` that say how guidance works, as far as they were given."""
+    guidance: dict[str, Any] = {}
+    if "schedule" in given:
+        schedule = given["schedule"]
+        if not (isinstance(schedule, str) and schedule in get_args(Schedule)):
+            raise ObservationError(
+                f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(get_args(Schedule))}"
+            )
+        guidance["schedule"] = schedule
+    if "max_guidance_weight" in given:
+        weight = as_number(given["max_guidance_weight"])
+        if weight is None or not 0 <= weight < np.inf:
+            shown = given["max_guidance_weight"]
+            raise ObservationError(f"{PREFIX}max_guidance_weight is {shown!r:.100}; it should be a number from 0")
+        guidance["max_guidance_weight"] = float(weight)
+    return guidance
+
+
+def as_number(value: object) -> int | float | None:
+    """A message's number: Python's, NumPy's, or an array's without axes. None for all else: booleans, times."""
+    if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "iuf":
+        value = value.item()
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _whole(given: Mapping[str, Any], key: str, least: int, most: int = MAX_STEP) -> int | None:
+    if given.get(key) is None:
+        return None
+    value = as_number(given[key])
+    if not isinstance(value, int) or not least <= value <= most:
+        raise ObservationError(f"{PREFIX}{key} is {given[key]!r:.100}; it should be a whole number from {least}")
+    return value
+
+
+def _flag(given: Mapping[str, Any], key: str) -> bool:
+    value = given.get(key, False)
+    if not isinstance(value, bool | np.bool_):
+        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be true or false")
+    return bool(value)
+
+
+def _numbers(given: Mapping[str, Any], key: str, dtype: type[np.floating[Any]] = np.float32) -> np.ndarray:
+    value = given[key]
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+        raise ObservationError(f"{PREFIX}{key} is {type(value).__name__}; it should be an array of numbers")
+    with np.errstate(over="ignore"):
+        array = value.astype(dtype)
+    if not (finite := np.isfinite(array)).all():
+        raise ObservationError(f"{_first(value, ~finite, key)}; all should be finite in {np.dtype(dtype)}")
+    return array
+
+
+def _first(values: np.ndarray, wrong: np.ndarray, key: str) -> str:
+    """The beginning of an error's text: the first value that is `wrong`, and its place."""
+    place = tuple(int(axis) for axis in np.argwhere(wrong)[0])
+    return f"{PREFIX}{key} has {float(values[place]):.3g} at {list(place)}"

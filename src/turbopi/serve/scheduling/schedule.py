@@ -1,0 +1,498 @@
+"""Whose turn it is: earliest deadline first, robots before simulators, batches where they pay.
+
+When more ask than can be served (a place or a firm deadline was refused within CROWDED_SECONDS), claims come before
+deadlines. A source's claim is how long it usually pauses before it asks, from its last request, answer or refusal on;
+LONG turns are as good as any longer pause. So a robot that asks five times a second has a strong claim, and a client
+that asks again at once has a weak one, however often it was refused. Of about equal claims the earlier deadline
+decides. The order goes by this, and so does who gives way in a full line: simulators to robots, then a source that
+has more than its share of the places, then the weakest claim, then the latest deadline. A quarter of the places are
+safe: those of the sources that were served longest ago, so that nobody is refused for ever. Neither a short deadline
+nor a new connection is a claim.
+
+A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py asks `decide`
+whenever something has changed or the moment `Decision.wake` has come, and runs the turn that it is given.
+
+What holds:
+
+- Requests with the same deadline, priority, size and, in a crowd, claim run in the order in which they came.
+- A request may be overtaken (a turn goes to one that came later) OVERTAKEN times. Of those that were, the one that came
+  first gets every other turn at least: nobody starves, not even simulators.
+- What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
+  long; else as soon as that is so. Without one, nothing is refused for being late.
+- A turn has no more observations than the table T(B) says is worth it, nor than fit the earliest deadline in it.
+"""
+
+import math
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from operator import attrgetter
+from statistics import median
+from typing import Any, Literal
+
+from turbopi.serve.scheduling.batch_times import SAFE, BatchTimes
+from turbopi.serve.scheduling.think_time import Pauses, Returns
+
+Priority = Literal["robot", "simulator"]
+PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
+
+OVERTAKEN = 16
+ACTIVE_SECONDS = 1.0  # who asked within it may ask again soon: company to wait for
+TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of others may be
+GAPS = 32  # times between two arrivals, the last ones: their median is how soon company comes
+LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late timer must not shrink the batch
+PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
+CROWDED_SECONDS = 1.0
+LONG = 8.0  # turns: who pauses so long takes a ninth of the policy's time at most
+NEW = 1 / 16  # the claim of a source that wasn't seen lately: weaker than a robot's
+WEAKEST = 12  # levels of claims, from 0; one is a factor of √2
+SAFE_PLACES = 1 / 4  # of the line: those of the sources that were served longest ago
+LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
+
+
+@dataclass(eq=False)
+class Request:
+    """Observations that wait for one run of the policy.
+
+    arrived   when it came
+    deadline  when its answer is wanted
+    firm      the client said so: it is refused if it can't have its answer by then
+    source    who asks (a connection)
+    session   its name, if it has one: a newer request of the session replaces one that waits
+    rows      observations in it; they run together
+    later     observations of the same message that are still to be asked for: the deadline is for the last of them
+    alone     never in a batch with others
+    joins     it joins a chunk or asks for model_actions: runs with such a request have a table T(B) of their own
+    call      what to run; not looked at here
+    """
+
+    arrived: float
+    deadline: float
+    firm: bool = False
+    priority: Priority = "robot"
+    source: Hashable = None
+    session: str | None = None
+    rows: int = 1
+    later: int = 0
+    alone: bool = False
+    joins: bool = False
+    continued: bool = False  # of a message that has its place in the line already
+    slowed: bool = False  # its source is read more slowly than it sends: its pauses say nothing, and it has no claim
+    call: Any = None
+    number: int = field(default=0, init=False)  # in the order in which they came
+    overtaken: int = field(default=0, init=False)
+    order: tuple[float, ...] = field(default=(), init=False)  # robots, then the earliest deadline, then who came first
+    in_crowd: tuple[float, ...] = field(default=(), init=False)  # the same, with the claim before the deadline
+    queued: float = field(default=0.0, init=False)  # when it was added
+    level: int = field(default=WEAKEST, init=False)  # of its claim; 0 is the strongest
+    served: float = field(default=0.0, init=False)  # when its source was answered last, or came first
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A request that gets no run, why, and what its client is told."""
+
+    request: Request
+    kind: Literal["busy", "late", "replaced"]
+    text: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do now.
+
+    turn     requests to run together; empty: none yet
+    refused  requests to answer with a refusal
+    wake     when to ask again, if nothing changes before; None: not at all
+    """
+
+    turn: tuple[Request, ...] = ()
+    refused: tuple[Refused, ...] = ()
+    wake: float | None = None
+
+
+_ORDER: Callable[[Request], tuple[float, ...]] = attrgetter("order")
+_IN_CROWD: Callable[[Request], tuple[float, ...]] = attrgetter("in_crowd")
+
+
+class _Recent:
+    """What sources did last, for a while."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._last: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()
+
+    def note(self, source: Hashable, value: float, now: float) -> None:
+        self._last[source] = (now, value)
+        self._last.move_to_end(source)
+        self._drop(now)
+
+    def values(self, now: float) -> dict[Hashable, float]:
+        self._drop(now)
+        return {source: value for source, (_, value) in self._last.items()}
+
+    def _drop(self, now: float) -> None:
+        while self._last and next(iter(self._last.values()))[0] < now - self._seconds:
+            self._last.popitem(last=False)
+
+
+class Schedule:
+    """Requests that wait for a policy that runs one turn at a time.
+
+    queue_limit  requests that may wait while a turn runs
+    times        T(B); one that forms no batches by default
+    turns        how long a turn keeps the next one from beginning, where that isn't T(B): a pipelined policy
+    joining      T(B) of runs in which a chunk is joined; by default they form no batches
+    """
+
+    def __init__(
+        self,
+        queue_limit: int,
+        times: BatchTimes | None = None,
+        turns: BatchTimes | None = None,
+        joining: BatchTimes | None = None,
+    ) -> None:
+        self.queue_limit = queue_limit
+        self.times = BatchTimes() if times is None else times
+        self._turns = self.times if turns is None else turns
+        self._joining = BatchTimes() if joining is None else joining
+        self._waiting: list[Request] = []
+        self._running: tuple[Request, ...] = ()
+        self._until = 0.0  # when the running turn is expected to end
+        self._free_since = -math.inf
+        self._number = 0
+        self._exhausted_last = False  # the last turn went to one that had been overtaken too often
+        self._active = _Recent(ACTIVE_SECONDS)
+        self._tight = _Recent(TIGHT_SECONDS)
+        self._last_arrival = -math.inf
+        self._gaps: deque[float] = deque(maxlen=GAPS)
+        self._returns = Returns()
+        self._pauses = Pauses()
+        # When one was refused a place last: the numbers and sources of those that waited, and what it was.
+        self._line: list[int] = []
+        self._sources: frozenset[Hashable] = frozenset()
+        self._refused: tuple[Priority, int, float, float] | None = None
+        self.crowded_until = -math.inf  # claims come before deadlines until then
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait."""
+        return len(self._waiting)
+
+    @property
+    def running(self) -> bool:
+        return bool(self._running)
+
+    def waits(self, session: str) -> bool:
+        """Whether a request of that session waits: a newer one would replace it."""
+        return any(request.session == session for request in self._waiting)
+
+    # --- requests come and go -----------------------------------------------------------------------------------------
+
+    def add(self, request: Request, now: float) -> list[Refused]:
+        """A request has come. Those that are refused for it: an older one, or itself."""
+        self._note(request, now)
+        if (late := self._late_on_arrival(request, now)) is not None:
+            return self._refuse([late], now)
+        refused = self._replace(request)
+        if not request.continued and self.waiting >= self._places:
+            self.crowded_until = now + CROWDED_SECONDS
+            gives_way = request if self._no_better(request) else self._gives_way(request)
+            text = f"busy: {self.queue_limit} requests wait already (--queue-limit {self.queue_limit}); try again"
+            if gives_way is not request:
+                text += " later: this one gave its place to another that pauses longer, or is more urgent"
+                self._waiting.remove(gives_way)
+            refused.append(Refused(gives_way, "busy", text))
+            if gives_way is request:
+                if request.source not in self._sources:  # not for having more than its share
+                    self._refused = request.priority, request.level, request.deadline, request.served
+                return self._refuse(refused, now)
+        self._waiting.append(request)
+        if request.firm and request.priority == "robot":
+            self._tight.note(request.source, request.deadline - request.arrived, now)
+        return self._refuse(refused, now)
+
+    def remove(self, request: Request) -> None:
+        """Nobody waits for its answer any more."""
+        if request in self._waiting:
+            self._waiting.remove(request)
+
+    def put_back(self, request: Request) -> None:
+        """It was in a batch that failed: it waits again, where it was in the order, and runs alone."""
+        request.alone = True
+        self._waiting.append(request)
+
+    def stop(self) -> list[Request]:
+        """All that wait, which wait no more."""
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+    def freed(self, now: float, seconds: float | None) -> None:
+        """The running turn has ended: the next one may begin.
+
+        seconds  that it took, for T(B); None if they say nothing of how long such a turn takes
+        """
+        if seconds is not None:
+            rows = sum(request.rows for request in self._running)
+            self._turn_times(self._running).ran(rows, seconds, now)
+        for request in self._running:
+            if not request.later:
+                self._returns.answered(request.source, now)
+                self._pauses.served(request.source, now)
+        self._running, self._free_since = (), now
+
+    @property
+    def _places(self) -> int:
+        return self.queue_limit + (not self._running)  # with nothing running, one of those that wait is about to
+
+    def _replace(self, request: Request) -> list[Refused]:
+        older = [one for one in self._waiting if request.session is not None and one.session == request.session]
+        for one in older:
+            self._waiting.remove(one)
+        text = f"replaced: a newer observation of session {request.session!r} came before this one had its turn"
+        return [Refused(one, "replaced", text) for one in older]
+
+    def _refuse(self, refused: list[Refused], now: float) -> list[Refused]:
+        """A source that was refused begins its pause anew."""
+        for one in refused:
+            self._pauses.replied(one.request.source, now)
+        return refused
+
+    def _no_better(self, request: Request) -> bool:
+        """Whether it has no more claim than one that the same line refused: then it needs no closer look."""
+        if self._refused is None or request.source in self._sources:
+            return False
+        if [one.number for one in self._waiting] != self._line:
+            return False
+        priority, level, deadline, served = self._refused
+        same = request.priority == priority
+        return same and request.level >= level and request.deadline >= deadline and request.served >= served
+
+    def _gives_way(self, request: Request) -> Request:
+        """The one of a full line and a newcomer that gets no place; the module says by which rule."""
+        some = [one for one in self._waiting if not one.continued]
+        some.append(request)
+        if any(one.priority != request.priority for one in some):
+            some = [one for one in some if one.priority == "simulator"]
+        places = Counter([one.source for one in self._waiting])
+        self._line, self._sources = [one.number for one in self._waiting], frozenset(places)
+        self._refused = None
+        places[request.source] += 1
+        most = max([places[one.source] for one in some])
+        if most > max(1, self._places // len(places)):
+            return min([one for one in some if places[one.source] == most], key=_strength)
+        weakest = min(some, key=_strength)
+        safe = int(len(some) * SAFE_PLACES)
+        if not safe or sum([one.served < weakest.served for one in some]) >= safe:
+            return weakest
+        longest_ago = sorted(some, key=lambda one: one.served)[:safe]
+        return min([one for one in some if one not in longest_ago], key=_strength)
+
+    def _note(self, request: Request, now: float) -> None:
+        """Give it its number, and learn how soon others follow."""
+        self._number += 1
+        request.number, request.queued = self._number, now
+        if not request.continued:
+            self._returns.asked(request.source, now)
+            claim, request.served = self._pauses.asked(request.source, LONG * self._seconds(request, now), NEW, now)
+            request.level = min(WEAKEST, int(-2 * math.log2(claim))) if claim > 0 and not request.slowed else WEAKEST
+        priority = PRIORITIES.index(request.priority)
+        request.order = priority, request.deadline, request.number
+        request.in_crowd = priority, request.level, request.deadline, request.number
+        if not (request.alone or request.continued):
+            if now - self._last_arrival <= ACTIVE_SECONDS:
+                self._gaps.append(now - self._last_arrival)
+            self._last_arrival = now
+            self._active.note(request.source, 0.0, now)
+
+    # --- deadlines ----------------------------------------------------------------------------------------------------
+
+    def _late_on_arrival(self, request: Request, now: float) -> Refused | None:
+        if not request.firm:
+            return None
+        order = self._order(now)
+        before = [one for one in self._waiting if order(one) < order(request)]
+        others = [one for one in before if not one.alone]
+        together = sum(one.rows for one in others)
+        wait = self._until_free(now) + sum(self._turn_seconds((one,), now) for one in before if one.alone)
+        run = self._seconds(request, now)
+        if self._turns is self.times and not request.alone:  # it may run together with those before it
+            rows = together + request.rows + request.later
+            wait += max(0.0, self._times((*others, request)).total(rows, now) - run)
+        else:
+            wait += self._turn_seconds(others, now)
+        if now + wait + run <= request.deadline:
+            return None
+        if before:
+            self.crowded_until = now + CROWDED_SECONDS
+        return self._late(request, now, wait, run)
+
+    def _hopeless(self, now: float) -> list[Refused]:
+        """Those that wait and can't meet their deadline any more; they wait no longer."""
+        wait = self._until_free(now)
+        late = [one for one in self._waiting if one.firm and now + wait + self._seconds(one, now) > one.deadline]
+        for one in late:
+            self._waiting.remove(one)
+        return self._refuse([self._late(one, now, wait, self._seconds(one, now)) for one in late], now)
+
+    def _until_free(self, now: float) -> float:
+        """Seconds until the running turn is expected to end."""
+        return max(0.0, self._until - now) if self._running else 0.0
+
+    def _seconds(self, request: Request, now: float) -> float:
+        """From the beginning of its turn to the actions of all rows of its message, if they run on their own."""
+        return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
+
+    def _turn_seconds(self, requests: Iterable[Request], now: float) -> float:
+        """For how long turns of these, which may run together, keep others from theirs."""
+        requests = tuple(requests)
+        return self._turn_times(requests).total(sum(request.rows for request in requests), now)
+
+    def _times(self, requests: Iterable[Request]) -> BatchTimes:
+        """T(B) of runs of these."""
+        return self._joining if any(request.joins for request in requests) else self.times
+
+    def _turn_times(self, requests: Iterable[Request]) -> BatchTimes:
+        """The same, of how long they keep the next turn from beginning."""
+        return self._joining if any(request.joins for request in requests) else self._turns
+
+    def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
+        since, deadline = now - request.arrived, request.deadline - request.arrived
+        text = (
+            f"late: {since * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
+            f"more ({wait * 1e3:.1f} ms until its turn, {run * 1e3:.1f} ms in the policy), but its deadline is "
+            f"{deadline * 1e3:.1f} ms: ask earlier, or give it more time"
+        )
+        return Refused(request, "late", text)
+
+    def _next_hopeless(self, now: float) -> float | None:
+        """When the first of those that wait can't meet its deadline any more, if nothing happens before."""
+        moments = [request.deadline - self._seconds(request, now) + LATER for request in self._waiting if request.firm]
+        return min(moments, default=None)
+
+    def _order(self, now: float) -> Callable[[Request], tuple[float, ...]]:
+        """Robots first, then in a crowd the strongest claim, then the earliest deadline, then who came first."""
+        return _IN_CROWD if now < self.crowded_until else _ORDER
+
+    # --- turns --------------------------------------------------------------------------------------------------------
+
+    def decide(self, now: float) -> Decision:
+        """The next turn, if one may begin. It then runs until `freed`."""
+        refused = tuple(self._hopeless(now))
+        wake = self._next_hopeless(now)
+        if self._running or not self._waiting:
+            return Decision((), refused, wake)
+        head, exhausted = self._head(now)
+        group = self._company(head, now)
+        rows = sum(request.rows for request in group)
+        until = -math.inf if exhausted or head.alone or len(group) < self.waiting else self._window(group, rows, now)
+        if until > now:
+            return Decision((), refused, until if wake is None else min(until, wake))
+        turn = self._fitting(group, now)
+        for request in turn:
+            self._waiting.remove(request)
+        last = max(request.number for request in turn)
+        for request in self._waiting:
+            request.overtaken += request.number < last
+        self._running, self._exhausted_last = turn, exhausted
+        self._until = now + self._turn_seconds(turn, now)
+        refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
+        return Decision(turn, refused, self._next_hopeless(now))
+
+    def _head(self, now: float) -> tuple[Request, bool]:
+        """Whose turn it is, and whether that is because it was overtaken too often: such turns aren't two in a row."""
+        exhausted = [request for request in self._waiting if request.overtaken >= OVERTAKEN]
+        others = [request for request in self._waiting if request.overtaken < OVERTAKEN]
+        if exhausted and not (self._exhausted_last and others):
+            return min(exhausted, key=lambda request: request.number), True
+        return min(others, key=self._order(now)), False
+
+    def _company(self, head: Request, now: float) -> list[Request]:
+        """The head, and behind it in their order those that may run together with it."""
+        if head.alone:
+            return [head]
+        others = (one for one in self._waiting if one is not head and not one.alone and one.priority == head.priority)
+        return [head, *sorted(others, key=self._order(now))]
+
+    def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
+        """The first of a group, as many as pay and as keep the deadlines.
+
+        If some join a chunk and others don't, these may pay more without the others.
+        """
+        alike = [request for request in group if request.joins == group[0].joins]
+        turns = [self._first_that_pay(some, now) for some in ([group] if len(alike) == len(group) else [group, alike])]
+        return max(turns, key=lambda turn: sum(request.rows for request in turn))
+
+    def _first_that_pay(self, group: list[Request], now: float) -> tuple[Request, ...]:
+        if len(group) == 1:
+            return tuple(group)
+        rows = sum(request.rows for request in group)
+        best = self._times(group).best(rows, now, self._longest(group, now))
+        turn, taken = [group[0]], group[0].rows
+        for request in group[1:]:
+            if taken + request.rows > best:
+                break
+            turn.append(request)
+            taken += request.rows
+        return tuple(turn)
+
+    def _longest(self, group: Iterable[Request], now: float) -> float:
+        """Seconds that a batch may take: for the deadlines in it, and for a robot that may ask while it runs.
+
+        A robot whose deadline is shorter than two runs has no guarantee, and none is tried for it.
+        """
+        group = tuple(group)
+        alone = self._times(group).seconds(1, now) or 0.0
+        slacks = [one.deadline - now for one in group if one.firm]
+        sources = {request.source for request in group}
+        tight = (within - alone for source, within in self._tight.values(now).items() if source not in sources)
+        slacks += [slack for slack in tight if slack >= alone]
+        return max(alone, min(slacks, default=math.inf))
+
+    def part(self, rows: int, now: float) -> int:
+        """Of `rows` observations of one message, how many to ask for at once."""
+        return self.times.best(rows, now, self._longest((), now))
+
+    def _window(self, group: list[Request], rows: int, now: float) -> float:
+        """Until when to wait for company; it is over if that isn't later than now.
+
+        Company is waited for if it saves more time than it takes to come: clients that were answered and usually ask
+        again so soon, as long as the saving after they were expected; or else anybody at the usual pace, as long as the
+        saving and not longer than a few usual gaps after the last arrival. Only while all deadlines of the group leave
+        room for T(B).
+        """
+        times = self._times(group)
+        sources = {request.source for request in group}
+        places = min(self._places - len(group), times.formed_largest(now) - rows)
+        if places < 1:
+            return -math.inf
+        opened = max(self._free_since, min(request.arrived for request in group))
+        deadline = min(request.deadline for request in group)
+        together = times.total(rows, now)
+
+        def saving(more: int) -> float:
+            return together + times.total(more, now) - times.total(rows + more, now)
+
+        def latest(more: int) -> float:
+            safe = times.seconds(rows + more, now, SAFE)
+            return -math.inf if safe is None else deadline - safe - LATE_TIMER
+
+        expected = self._returns.expected(now, ACTIVE_SECONDS, sources)[:places]
+        for more in range(len(expected), 0, -1):
+            when, last = expected[more - 1]
+            if when - now < saving(more) and (until := min(last, when + saving(more), latest(more))) > now:
+                return until
+        most = min(places, len(self._active.values(now).keys() - sources))
+        if most < 1 or len(self._gaps) < GAPS // 4:
+            return -math.inf
+        gap = median(self._gaps)
+        until = max(
+            (min(opened + saving(more), latest(more)) for more in range(1, most + 1) if saving(more) > more * gap),
+            default=-math.inf,
+        )
+        return min(until, self._last_arrival + PATIENCE * gap)
+
+
+def _strength(request: Request) -> tuple[int, float, int]:
+    """Smallest for the one that gives its place to another."""
+    return -request.level, -request.deadline, -request.number
