@@ -10,7 +10,7 @@ import torch
 from conftest import golden_cases, golden_folder
 
 from turbopi import backends
-from turbopi.backends.timing import StageTimer
+from turbopi.backends.base import StageTimer
 from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.support.errors import BackendUnavailable, ConfigError
 from turbopi.verify.check_golden import check_case

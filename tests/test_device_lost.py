@@ -40,7 +40,7 @@ class Failing:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def sample(self, *arguments: Any) -> Sample:
+    def sample(self, *arguments: Any, conditioning: None = None) -> Sample:
         self.calls += 1
         if self.fail is not None:
             raise self.fail
@@ -53,6 +53,8 @@ class Failing:
 
 class FailingLater(Failing):
     """Failures come with the answers."""
+
+    submits = True
 
     def submit(self, *arguments: Any) -> "Future[Sample]":
         future: Future[Sample] = Future()
@@ -208,7 +210,7 @@ def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None
             return "blocks of the denoising kernel waited for seconds: layer 3 for queries"
 
     fused: Any = FusedBackend.__new__(FusedBackend)
-    fused._denoisers, fused._pair_denoisers, fused._keepers = {(10, 10, 1024): Kernel()}, {}, {}
+    fused._kernels = {"refused": "too many", "made": Kernel()}
     with pytest.raises(DeviceLost) as explained:
         fused._explain(RuntimeError("CUDA error: unspecified launch failure"))
     assert isinstance(policy.backend, Failing)

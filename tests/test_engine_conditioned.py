@@ -12,7 +12,6 @@ from test_begin import OnCpu, Unrun, on_cpu
 from test_engine import FIELDS, made_up
 from torch import Tensor
 
-from turbopi.backends.abilities import Abilities
 from turbopi.config import Kind
 from turbopi.engine.conditioned import MOST_TIMES, conditioned_loop
 from turbopi.engine.graph_cache import MOST_LOOPS, Loop
@@ -183,4 +182,4 @@ def test_too_many_times_are_refused() -> None:
 
 
 def test_backends_say_which_forms_they_have() -> None:
-    assert set(Abilities(on_cpu()).forms) == {"solver", "tokens", "jacobian"}
+    assert set(on_cpu().forms) == {"solver", "tokens", "jacobian"}

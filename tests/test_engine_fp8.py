@@ -1,7 +1,7 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
@@ -12,6 +12,7 @@ from test_begin import Unrun, on_cpu
 from test_engine import answer, made_up, shape_of
 from torch import Tensor
 
+from turbopi.backends.expert_store import ExpertStore, User
 from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
 from turbopi.engine import forward
@@ -20,13 +21,14 @@ from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.engine.graph_cache import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation, pack
+from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.plain import PLAIN
-from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.models.observation import Observation
 from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
 from turbopi.quantization.formats import FORMATS, FP8, Format
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix
+from turbopi.quantization.plan import Tier
 from turbopi.quantization.sites import Site, sites
 from turbopi.support.errors import BackendUnavailable
 from turbopi.verify.check_golden import golden_calibration
@@ -208,151 +210,119 @@ def test_nothing_rounded_changes_nothing() -> None:
     assert torch.equal(model.sample(case.observation, case.noise, STEPS), before)
 
 
-def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
+def fused(device: torch.device, quantization: Quantization | None, precision: Tier = "fp8") -> FusedBackend:
+    """A backend that has its weights and has run nothing."""
     backend = FusedBackend.__new__(FusedBackend)
+    backend.config, backend.device = golden_model("pi05").config, device
+    backend._quantization = quantization
+    backend._plan = None if quantization is None else quantization.plan(backend.config, precision)
     state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights, backend._refused = pack(golden_model("pi05").config, state), {}
-    layers = backend._weights.expert
-
-    def places() -> set[str]:
-        return {x.device.type for layer in layers for x in (layer.qkv, layer.out, layer.gate_up, layer.down)}
-
-    backend._keep_expert_on(META)  # instead of a GPU
-    assert places() == {"meta"} and layers[0].norm1 is None
-    layers[0] = dataclasses.replace(layers[0], qkv=torch.zeros_like(layers[0].qkv, device=CPU))
-    backend._keep_expert_on(META)
-    assert places() == {"meta"}
-    moved: list[torch.device] = []
-    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    backend._put_expert_away()
-    assert moved == [CPU]
-    backend._refused[Loop(10, 60), 968] = "too many"
-    backend._put_expert_away()
-    assert moved == [CPU]
+    backend._weights = pack(backend.config, state, backend._quantized)
+    backend._expert = ExpertStore(backend._weights.expert, device, {"packed": backend._packed, "fp8": backend._in_fp8})
+    backend._kernels, backend._calls, backend._graphs, backend._ops = {}, {}, {}, PLAIN
+    backend._recent = RecentLoops(backend._forget)
+    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
+    return backend
 
 
-def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
-    """In bfloat16 with the expert's first copy, which stays; in FP8 with matrices of their own, and it goes away."""
-    backend = FusedBackend.__new__(FusedBackend)
-    moved: list[torch.device] = []
-    backend.config, backend.device = golden_model("pi05").config, CPU
-    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights, backend._refused, backend._plan = pack(backend.config, state), {}, None
-    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    assert backend._batch_weights() is backend._weights
-    backend._put_expert_away()
-    assert moved == [CPU], "it is asked for, and then not let go"
-    assert backend._batch_denoises_by(Loop(2, 5, "tokens", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
-
-    backend = FusedBackend.__new__(FusedBackend)
-    moved = []
-    backend.config, backend.device = golden_model("pi05").config, torch.device("meta")
+def whole_calibration() -> Quantization:
+    """The golden model's, which keeps nothing in bfloat16."""
     calibration = golden_calibration(golden_folder(), "pi05", CPU)
     every = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
-    backend._plan = dataclasses.replace(calibration, sites=every).plan(backend.config, "fp8")
-    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights, backend._refused = pack(backend.config, state), {}
-    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    expert = backend._batch_weights().expert
-    assert moved == [backend.device, CPU]
+    return dataclasses.replace(calibration, sites=every)
+
+
+def places(layers: Sequence[GemmaLayer[Any]]) -> set[str]:
+    return {x.device.type for layer in layers for x in vars(layer).values() if x is not None}
+
+
+PLAIN_LOOP, BY_TOKEN = Loop(2, 5), Loop(2, 5, "tokens", (1.0, 0.5, 0.0))
+JACOBIAN = Loop(2, 5, "jacobian", (1.0, 0.5, 0.0))
+
+
+def batch_weights(backend: FusedBackend, loop: Loop) -> Weights:
+    weights = backend._batch_denoises_by(loop, 4, 64)
+    assert isinstance(weights, Weights)
+    return weights
+
+
+def test_batches_denoise_in_fp8_with_matrices_of_their_own_which_go_with_the_last_of_them() -> None:
+    backend = fused(CPU, whole_calibration())
+    expert = batch_weights(backend, PLAIN_LOOP).expert
+    assert backend._plan is not None and not backend._expert.users["layers"]
     for i, (ours, bf16) in enumerate(zip(expert, backend._weights.expert, strict=True)):
         for kind in ("qkv", "out", "gate_up", "down"):
             made, was, scale = getattr(ours, kind), getattr(bf16, kind), backend._plan.scales[f"expert.{i}.{kind}"]
             assert isinstance(made, ScaledMatrix) and made.inverse == 1 / scale
             assert float((made.dequantized() - was).norm() / was.norm()) < 0.05
-    assert backend._batch_weights().expert is expert
+    assert batch_weights(backend, BY_TOKEN).expert is expert
+    assert backend.describe()["fp8"]["plan"]["expert of batches"] == "fp8"
+    backend._expert.release(lambda user: True)
+    assert not backend._expert._built and "expert of batches" not in backend.describe()["fp8"]["plan"]
 
 
-def test_batches_guided_by_the_jacobian_keep_the_experts_first_copy_beside_fp8() -> None:
-    backend = FusedBackend.__new__(FusedBackend)
-    moved: list[torch.device] = []
-    backend.config, backend.device = golden_model("pi05").config, CPU
-    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights, backend._refused = pack(backend.config, state), {}
-    backend._plan = cast(Any, SimpleNamespace(expert="fp8", scales={}))
-    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    assert backend._batch_denoises_by(Loop(2, 5, "jacobian", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
-    assert moved == [CPU] and not backend._batches_denoise_in_bf16
-    backend._put_expert_away()
-    assert moved == [CPU], "it is asked for, and then not let go"
+def test_batches_guided_by_the_jacobian_read_the_experts_bfloat16_copy_beside_fp8() -> None:
+    backend = fused(META, whole_calibration())
+    assert batch_weights(backend, JACOBIAN).expert is backend._weights.expert
+    assert places(backend._weights.expert) == {"meta"}
+    plan = backend.describe()["fp8"]["plan"]
+    assert "guided by the Jacobian" in str(plan.keys()) and "expert of batches" not in plan
 
 
 def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> None:
     """The kernel's weights alone are int8; of operations there is no such product."""
-    backend = FusedBackend.__new__(FusedBackend)
-    moved: list[torch.device] = []
-    backend.config, backend.device = golden_model("pi05").config, torch.device("meta")
-    every = {str(site): SiteScale(1.0, 4.0, 0.0, 0.01) for site in sites(backend.config)}
+    config = golden_model("pi05").config
+    every = {str(site): SiteScale(1.0, 4.0, 0.0, 0.01) for site in sites(config)}
     report = {"observations": {"source": "recordings"}, "warnings": []}
-    calibration = Quantization("0" * 64, shapes_of(backend.config), every, report, "int8")
-    backend._quantization, backend._plan = calibration, calibration.plan(backend.config, "int8")
-    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights = pack(backend.config, state, backend._quantized)
+    backend = fused(CPU, Quantization("0" * 64, shapes_of(config), every, report, "int8"), "int8")
     *before, last = (layer.qkv for layer in backend._weights.vlm)
     assert {matrix.numbers for matrix in before} == {torch.int8} and isinstance(last, Tensor)  # type: ignore[union-attr]
-    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = {}, PLAIN, {}, {}, {}
-    backend._keepers = {}
-    backend._packed_expert = None
-    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
-    backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     told = backend.describe()["int8"]["plan"]
     assert told["expert"] == told["expert.down"] == told["prefix.out"] == "int8" and "expert of batches" not in told
     assert told["prefix.qkv"]["int8"] == "layers 0, 1" and "bf16: INT8 has no NaN" in " ".join(told["prefix.qkv"])
-    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    assert backend._batch_weights() is backend._weights and moved == [backend.device]
+    assert batch_weights(backend, PLAIN_LOOP).expert is backend._weights.expert
     assert backend.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"
-    backend.device = CPU  # where the kernel's weights are to lie
-    packed = backend._packed(PackedExpert)
+    backend._on_hopper = False
+    packed = backend._expert.use("packed", User("single", PLAIN_LOOP, 64))
     assert packed.numbers == "int8" and bool((packed.inputs == 1).all())
 
 
 def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
-    backend, calibration = FusedBackend.__new__(FusedBackend), golden_calibration(golden_folder(), "pi05", CPU)
-    everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
-    calibration = dataclasses.replace(calibration, sites=everything)
-    backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
-    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._keepers = {}, PLAIN, {}, {}, {}
-    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
-    backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
-    backend._refused = {
-        (Loop(5, 60), 968): "too many",
-        (Loop(10, 60), 968): "too many",
-        (Loop(10, 60), 1224): "too many",
+    backend = fused(CPU, whole_calibration())
+    refused: dict[User, Any] = {
+        User("single", Loop(steps, 60), rows): "too many" for steps, rows in ((5, 968), (10, 968), (10, 1224))
     }
+    backend._kernels = dict(refused)
     told = backend.describe()
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
     plan = told["fp8"]["plan"]
     assert plan["prefix.down"] == "fp8"
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]
-    backend._denoisers = {
-        (Loop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None))
-    }
+    kernel = SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None)
+    made = {User("single", Loop(10, 10), 968): kernel}
+    backend._kernels = refused | made
     assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
     clock[0] = 1795.4
     assert backend.describe()["denoising_clock_mhz"] == {"H=10, 10 steps": 1795}
     plan = backend.describe()["fp8"]["plan"]
     assert plan["expert.qkv"] == "fp8"
     assert plan["expert"] == "fp8 in the denoising kernel; bf16 where operations denoise"
-    backend._refused = {}
+    backend._kernels = made
     assert backend.describe()["fp8"]["plan"]["expert"] == "fp8"
 
 
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend, tried = FusedBackend.__new__(FusedBackend), []
-    backend.config, backend.device = golden_model("pi05").config, CPU
-    backend._denoisers, backend._pair_denoisers, backend._keepers, backend._refused = {}, {}, {}, {}
-    backend._packed_expert = None
-    monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
+    backend, tried = fused(CPU, None), []
 
-    def refuse(loop: Loop, rows: int, table: Tensor | None) -> NoReturn:
-        tried.append(loop)
+    def refuse(user: User, table: Tensor | None) -> NoReturn:
+        tried.append(user.loop)
         raise BackendUnavailable("it holds 3 clusters")
 
     monkeypatch.setattr(backend, "_denoising_kernel", refuse)
     assert all(backend._make_denoiser(CallShape(2, slots, Loop(5, 10)), None) is None for slots in (16, 32, 48))
     assert tried == [Loop(5, 10)]
-    assert [(key[0], why) for key, why in backend._refused.items()] == [(Loop(5, 10), "it holds 3 clusters")]
+    assert [(user.loop, why) for user, why in backend._refused().items()] == [(Loop(5, 10), "it holds 3 clusters")]
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

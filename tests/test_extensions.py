@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from cli_helpers import refusal, text_of, turbopi
@@ -13,9 +14,11 @@ from distributions import install
 
 from turbopi import UnifiedPolicy, backends
 from turbopi.checkpoint import random_checkpoint
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.support import extensions
-from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
 
 CPU = torch.device("cpu")
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -60,7 +63,10 @@ def documented(site: Path) -> Path:
 def test_the_documented_backend_is_listed_and_runs(documented: Path) -> None:
     listed = json.loads(turbopi("backends", "--device", "cpu", "--json").stdout)["backends"]
     (noted,) = (one for one in listed if one["name"] == "noted")
-    assert noted["available"] and noted["summary"] == "the reference, which counts its calls (turbopi-noted 0.1.0)"
+    assert (
+        noted["available"]
+        and noted["summary"] == "the reference in float32, which counts its calls (turbopi-noted 0.1.0)"
+    )
     policy, plain = (
         UnifiedPolicy(random_checkpoint("pi05_tiny"), backend=name, precision="f32", device="cpu")
         for name in ("noted", "pytorch")
@@ -69,6 +75,13 @@ def test_the_documented_backend_is_listed_and_runs(documented: Path) -> None:
     ours, theirs = (one.infer(observation, seed=0, num_steps=1)["actions"] for one in (policy, plain))
     assert (ours == theirs).all()
     assert policy.metadata["backend"] == "noted" and policy.metadata["backend_details"]["calls"] == 1
+    assert policy.metadata["real_time"]["modes"] == [] and not policy.runs_batches and not policy.pipelined
+    with pytest.raises(ObservationError, match="backend 'noted' has no times, held actions or guidance by token"):
+        policy.infer(observation, conditioning=Conditioning(held=np.arange(10) < 1, values=np.zeros((10, 32))))
+    with pytest.raises(ConfigError, match="backend 'noted' runs one observation at a time"):
+        policy.submit(observation)
+    with pytest.raises(BackendError, match="backend 'noted' has no halves of a call"):
+        policy.backend.prefix(Observation.stack([policy.prepare(observation)]))
 
 
 def test_the_documented_command_is_listed_without_being_imported_and_runs(documented: Path) -> None:
@@ -87,7 +100,8 @@ def test_the_documented_command_is_listed_without_being_imported_and_runs(docume
 BROKEN = {
     "toy_missing:Backend": "can't load the {}: ModuleNotFoundError: No module named 'toy_missing'",
     "toy_module:Missing": "can't load the {}: AttributeError: module 'toy_module' has no attribute 'Missing'",
-    "json:JSONEncoder": "the {} is no backend: it lacks name, precisions, any_horizon, unavailable, warmup, prefix, ",
+    "json:JSONEncoder": "the {} is no backend: it should derive from turbopi.backends.Backend",
+    "toy_module:Half": "the {} is no backend: it lacks precisions, load_weights, sample",
     "turbopi.backends.pytorch:PyTorchBackend": "the {} has the name 'pytorch'; expected 'broken'",
     "toy_exits:Backend": "can't load the {}: SystemExit: 3",
 }
@@ -95,7 +109,8 @@ BROKEN = {
 
 @pytest.mark.parametrize("value", BROKEN)
 def test_a_broken_backend_is_named_and_skipped(site: Path, value: str) -> None:
-    (site / "toy_module.py").write_text("")
+    half = "from turbopi.backends import Backend\nclass Half(Backend):\n    name = 'broken'\n"
+    (site / "toy_module.py").write_text(half)
     (site / "toy_exits.py").write_text("import sys\nsys.exit(3)\n")
     toy(site, extensions.BACKENDS, f'broken = "{value}"')
     why = BROKEN[value].format(f"entry point 'broken' = '{value}' in turbopi.backends, of toy 1.0")

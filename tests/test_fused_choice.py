@@ -13,6 +13,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.graph_cache import Loop
+from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
@@ -198,7 +199,7 @@ def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_
     kernels.refuse = "too small"
     shapes = [CallShape(3, slots, Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))) for slots in (16, 32)]
     assert [backend._make_keeper(shape, backend._call(shape).times.table) for shape in shapes] == [None, None]
-    assert len(tried) == 1 and backend._packed_expert is None
+    assert len(tried) == 1 and not backend._expert.users["packed"] and not backend._expert._built
 
 
 def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
@@ -288,8 +289,8 @@ class OnFakeGpu:
     def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
         self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).times.table
-        self.backend.device = GPU
-        layer: Any = GemmaLayer(**{name: Placed(GPU) for name in MATRICES}, norm1=None, norm2=None)
+        self.backend.device = self.backend._expert._device = GPU
+        layer: Any = GemmaLayer(**{name: Placed(CPU) for name in MATRICES}, norm1=None, norm2=None)
         self.backend._weights.expert[:] = [layer] * 3
         self.packed_from: list[set[torch.device]] = []
 
@@ -321,7 +322,7 @@ def gpu(kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> OnFakeGpu
 def test_the_expert_waits_on_the_host_while_only_kernels_denoise(gpu: OnFakeGpu) -> None:
     assert gpu.denoise(2) and gpu.places == {CPU}
     assert gpu.denoise(3) and gpu.places == {CPU}
-    assert gpu.packed_from == [{GPU}], "packed once, from the device"
+    assert gpu.packed_from == [{CPU}], "packed once, from the host"
 
 
 def test_operations_find_the_expert_on_the_device_whatever_was_there_before(gpu: OnFakeGpu) -> None:
@@ -346,5 +347,24 @@ def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgot
 
 def test_a_refused_first_kernel_leaves_no_packed_expert_behind(gpu: OnFakeGpu) -> None:
     assert not gpu.denoise(2, refuse="too small")
-    assert gpu.backend._packed_expert is None
-    assert gpu.denoise(3) and gpu.packed_from == [{GPU}, {GPU}]
+    assert not gpu.backend._expert._built
+    assert gpu.denoise(3) and gpu.packed_from == [{CPU}, {GPU}]
+
+
+def test_the_packed_expert_goes_with_the_last_kernel_and_is_packed_anew_for_the_next(gpu: OnFakeGpu) -> None:
+    assert gpu.denoise(2) and gpu.denoise(3)
+    gpu.backend._forget(Loop(2, 10))
+    assert gpu.backend._expert._built == {"packed": "packed"}, "the loop of 3 steps still has its kernel"
+    gpu.backend._forget(Loop(3, 10))
+    assert not gpu.backend._expert._built
+    assert gpu.denoise(2) and gpu.packed_from == [{CPU}, {CPU}]
+
+
+def test_the_expert_leaves_the_device_with_the_last_batch_that_operations_denoise(gpu: OnFakeGpu) -> None:
+    loops = [Loop(2, 10), Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))]
+    for loop in loops:
+        weights = gpu.backend._batch_denoises_by(loop, 4, 64)
+        assert isinstance(weights, Weights) and weights.expert is gpu.backend._weights.expert and gpu.places == {GPU}
+    for loop, places in zip(loops, ({GPU}, {CPU}), strict=True):
+        gpu.backend._forget(loop)
+        assert gpu.places == places

@@ -46,24 +46,22 @@ class Answering:
     def __init__(self, backend: Any, kind: str, clock: Clock) -> None:
         self._backend, self._clock = backend, clock
         self.actions = torch.zeros(1, H, D)
-        if kind == "begin":
-            self.begin = lambda pictures, resize: SimpleNamespace(finish=self._answer)
-        if kind == "submit":
-            self.submit = self._submit
+        self.runs_batches, self.submits = kind == "begin", kind == "submit"
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("begin", "submit"):
-            raise AttributeError(name)
         return getattr(self._backend, name)
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def begin_batch(self, *_: Any) -> Any:
+        return SimpleNamespace(finish=self._answer)
+
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: None) -> Sample:
         return self._answer()
 
     def _answer(self, *_: Any) -> Sample:
         self._clock.now += 1
         return Sample(self.actions, STAGES)
 
-    def _submit(self, *_: Any) -> "Future[Sample]":
+    def submit(self, *_: Any) -> "Future[Sample]":
         self._clock.now += 2  # until there is room
         future: Future[Sample] = Future()
         future.set_result(dataclasses.replace(self._answer(), queue_ms=2000.0))
@@ -97,7 +95,7 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
 ) -> None:
     policy, _, clock = answering(whole, kind)
     for module in ("policy", "model_call"):
-        monkeypatch.setattr(f"turbopi.{module}.time", SimpleNamespace(perf_counter=clock))
+        monkeypatch.setattr(f"turbopi.policy.{module}.time", SimpleNamespace(perf_counter=clock))
     pipeline = policy.pipeline
     first = "see" if kind == "begin" else "before"
     monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))

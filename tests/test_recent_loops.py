@@ -12,8 +12,10 @@ from tensorrt_fakes import golden_backend
 from test_begin import Unrun, on_cpu
 from test_engine import made_up
 from test_engine_batch import observations
+from test_fused_choice import GPU, MATRICES, Placed
 from torch import Tensor
 
+from turbopi.backends.expert_store import ExpertStore, User
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tensorrt.backend import TensorRTBackend
 from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
@@ -23,6 +25,7 @@ from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, Loop, RecentLoops
 from turbopi.engine.runner import HostRow
 from turbopi.engine.solving import evaluation_loops
 from turbopi.engine.without_compiler import OPS
+from turbopi.kernels.interface import GemmaLayer
 from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import BackendUnavailable, ObservationError
 
@@ -187,28 +190,21 @@ class Fused(FusedBackend):
 
     def __init__(self) -> None:
         self.config, self.device = golden_model("pi05").config, torch.device("cpu")
-        self._graphs, self._calls, self._tables, self._loops = {}, {}, {}, {}
-        self._denoisers, self._pair_denoisers, self._keepers, self._refused = {}, {}, {}, {}
-        self._packed_expert = None
+        self._graphs, self._calls, self._tables, self._loops, self._kernels = {}, {}, {}, {}, {}
+        layer: Any = GemmaLayer(**{name: Placed(self.device) for name in MATRICES}, norm1=None, norm2=None)
+        self._expert = ExpertStore([layer], GPU, {"packed": lambda layers: "packed"})
         self._recent = RecentLoops(self._forget)
         self._batches = SimpleNamespace(forget=lambda loop: None)  # type: ignore[assignment]
-        self.expert_on = "device"
 
-    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Any:
-        if loop.horizon >= 50:
+    @property
+    def expert_on(self) -> str:
+        return {"cuda": "device", "cpu": "host"}[self._expert._layers[0].qkv.device.type]
+
+    def _denoising_kernel(self, user: User, table: Tensor | None) -> Any:
+        self._expert.use("packed", user)
+        if user.loop.horizon >= 50:
             raise BackendUnavailable("too many")
-        self._put_expert_away()
         return SimpleNamespace()
-
-    def _keep_expert_on(self, device: torch.device) -> None:
-        self.expert_on = "host" if self._away else "device"
-
-    def _put_expert_away(self) -> None:
-        self._away = True
-        super()._put_expert_away()
-        self._away = False
-
-    _away = False
 
     def call(self, steps: int, horizon: int) -> Any:
         self._recent.use(Loop(steps, horizon))
@@ -217,16 +213,17 @@ class Fused(FusedBackend):
 
 def test_fuseds_kernels_go_with_their_loops_and_the_expert_goes_away_with_the_last_graph_that_reads_it() -> None:
     backend = Fused()
+    assert backend.expert_on == "host"
     assert backend.call(10, 50) is None and backend.expert_on == "device"
     for steps in range(1, MOST_LOOPS):
         assert backend.call(steps, 10) is not None
-    assert backend.expert_on == "device" and len(backend._refused) == 1  # a graph of operations points to it
+    assert backend.expert_on == "device" and len(backend._refused()) == 1  # a graph of operations points to it
     backend.call(MOST_LOOPS, 10)
-    assert not backend._refused and backend.expert_on == "host"
+    assert not backend._refused() and backend.expert_on == "host"
     assert backend.call(10, 50) is None and backend.expert_on == "device"
     for steps in STEPS:
         backend.call(steps, 10)
-    assert len(backend._denoisers) == MOST_LOOPS and backend.expert_on == "host"
+    assert len(backend._kernels) == MOST_LOOPS and backend.expert_on == "host"
 
 
 @pytest.mark.parametrize("cls", [TensorRTBackend, TensorRTPipelinedBackend])

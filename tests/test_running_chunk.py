@@ -15,7 +15,6 @@ from test_begin import OnCpu
 from test_policy import golden_policy
 
 from turbopi import UnifiedPolicy, open_checkpoint
-from turbopi.backends.abilities import Abilities
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
@@ -113,7 +112,7 @@ def test_identitys_mask_ends_where_it_does_in_chunks_of_another_length(
 ) -> None:
     """Of a policy whose mask ends at 6; a shorter chunk's ends with the left-over of 4."""
     config = dataclasses.replace(policy.config, real_time=RealTime(execution_horizon=H - 6))
-    joining = Joining(config, policy._pipeline, Abilities(policy.backend))
+    joining = Joining(config, policy._pipeline, policy.backend)
     ((_, chunk),) = joining.checked([None], [RunningChunk(rows(4), 1, mode="rtc_identity")], 2, horizon).rows
     assert chunk is not None and chunk.execution_horizon == s
 

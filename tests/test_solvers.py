@@ -264,7 +264,7 @@ def test_kernels_of_a_solvers_loop_are_forgotten_with_it_unless_another_loop_has
     for loop, left in zip(loops, (3, 0), strict=True):
         backend._recent._loops.pop(loop)
         backend._forget_all(loop)
-        assert len(backend._denoisers) == left
+        assert len(backend._made("single")) == left
 
 
 def test_a_solvers_loop_is_named_by_its_solver_and_grid() -> None:

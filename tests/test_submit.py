@@ -23,6 +23,8 @@ def policy() -> UnifiedPolicy:
 class Submitting:
     """The policy's backend with a `submit` that answers when it is told to."""
 
+    submits = True
+
     def __init__(self, backend: Any) -> None:
         self._backend = backend
         self.waiting: list[tuple[Future[Sample], Observation, Tensor, int]] = []

@@ -10,19 +10,20 @@ durations; waiting for it releases the GIL, as waiting for a CUDA event does. Ac
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from turbopi import UnifiedPolicy, serve
-from turbopi.backends import BACKENDS, BackendSpec, LoadState, Precision, Sample
+from turbopi.backends import BACKENDS, Backend, BackendSpec, LoadState, Precision, Sample
 from turbopi.checkpoint import random_checkpoint
-from turbopi.config import ImageResize, ModelConfig
+from turbopi.config import ImageResize
 from turbopi.engine.batch_runner import Asked, BegunBatch, Call, Finish
 from turbopi.engine.packing import pack_rows, split
-from turbopi.models.pi0.conditioning import Form
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditionings, Form
 
 # Milliseconds of vision, prefix and denoising of a call for so many observations of two pictures, and what `fused`
 # splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.
@@ -54,37 +55,21 @@ class Device:
             time.sleep(left)
 
 
-@dataclass
-class _Begun:
-    backend: "SleepingBackend"
-    cameras: int
-
-    def finish(
-        self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int, conditioning: None = None
-    ) -> Sample:
-        return self.backend.finish(1, [self.cameras], [tokens], state[None], noise[None])
-
-
-class SleepingBackend:
-    """Begins and RunsBatches, in the time that `gpu` says."""
+class SleepingBackend(Backend):
+    """Runs batches in the time that `gpu` says."""
 
     name: ClassVar[str] = "sleeping"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
-    any_horizon: ClassVar[bool] = True
+    runs_batches: ClassVar[bool] = True
     gpu: ClassVar[str] = "none"
-    strict = False
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
-        self.config, self.device, self.precision = config, device, precision
+    def load_weights(self, load: LoadState) -> None:
+        config = self.config
         self.stages, self.costs = GPUS[self.gpu]
         self._device = Device()
         side = config.vision.image_size
         self._pictures = np.zeros((4 * max(self.stages), side, side, 3), np.uint8)
         self._inputs = np.zeros((max(self.stages), config.action_horizon, config.action_dim), np.float32)
-
-    @classmethod
-    def unavailable(cls, device: torch.device) -> str | None:
-        return None
 
     @property
     def batch_costs(self) -> Mapping[int, float]:
@@ -92,27 +77,26 @@ class SleepingBackend:
 
     def warmup(self, *_: Any, **__: Any) -> None: ...
 
-    def warmup_batches(self, *_: Any, **__: Any) -> None: ...
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        raise NotImplementedError("a policy calls `begin_batch`")
 
     def describe(self) -> dict[str, Any]:
         return {"gpu": self.gpu}
 
-    def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> _Begun:
-        self._see(1, [pictures])
-        return _Begun(self, len(pictures))
-
     def begin_batch(
         self,
-        pictures: Sequence[Sequence[np.ndarray]],
+        images: Sequence[Sequence[np.ndarray]],
         resize: ImageResize | None = None,
         forms: Sequence[Form] | None = None,
     ) -> BegunBatch:
         calls: list[Call] = []
-        rows = list(range(len(pictures)))
-        for bucket in split(len(pictures), self.costs):
+        rows = list(range(len(images)))
+        for bucket in split(len(images), self.costs):
             calls.append((bucket, rows[:bucket]))
             rows = rows[bucket:]
-        return BegunBatch(self._begin_call, calls, pictures)
+        return BegunBatch(self._begin_call, calls, images)
 
     def _begin_call(self, bucket: int, pictures: Sequence[Sequence[np.ndarray]]) -> Finish:
         self._see(bucket, pictures)

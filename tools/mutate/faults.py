@@ -105,7 +105,7 @@ FAULTS = (
     Fault(
         "the expert left on the host where operations denoise",
         "turbopi.backends",
-        "self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it",
+        'self._expert.use("layers", user)  # while its graph is kept, as it points to them',
         "pass",
         "the first call whose loop the kernel refuses fails, after another loop had its kernel",
         (CHOICE,),
@@ -113,9 +113,8 @@ FAULTS = (
     Fault(
         "the expert put away from under a graph of operations",
         "turbopi.backends",
-        "if not (self._refused or self._batches_denoise_in_bf16 or self._batches_guide_in_bf16):\n"
-        "            self._keep_expert_on(",
-        "if True:\n            self._keep_expert_on(",
+        'if not self.users["layers"]:',
+        "if True:",
         "replays read freed memory",
         (CHOICE,),
     ),

@@ -11,18 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import (
-    Backend,
-    Begins,
-    Begun,
-    Conditions,
-    LoadState,
-    Precision,
-    RunsBatches,
-    RunsFp8,
-    Sample,
-    Submits,
-)
+from turbopi.backends.base import Backend, LoadState, Precision, Sample
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.quantization.calibration_file import Quantization
@@ -33,15 +22,9 @@ from turbopi.support.errors import BackendUnavailable, ConfigError
 __all__ = [
     "BACKENDS",
     "Backend",
-    "Begins",
-    "Begun",
-    "Conditions",
     "LoadState",
     "Precision",
-    "RunsBatches",
-    "RunsFp8",
     "Sample",
-    "Submits",
     "availability",
     "choose",
     "class_of",
@@ -126,10 +109,6 @@ _SPECS = (
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
 _RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}  # Turbo-Pi's own
-_MEMBERS = (  # of every backend
-    *("name", "precisions", "any_horizon", "unavailable", "warmup", "prefix", "denoise", "sample", "intermediates"),
-    "describe",
-)
 
 
 def known() -> dict[str, BackendSpec]:
@@ -237,7 +216,7 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
                 f"{precision} needs an NVIDIA GPU of compute capability {which}; take precision 'bf16', or to judge "
                 f"{format.label} without such a GPU backend 'emulated_{format.name}'"
             )
-        elif issubclass(cls, RunsFp8) and (other_gpu := cls.unavailable_in(device, precision)) is not None:
+        elif (other_gpu := cls.unavailable_in(device, precision)) is not None:
             reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")
@@ -257,9 +236,8 @@ def create(
     quantization   for FP8 and INT8 alone: the calibration of this very checkpoint
     """
     check(name, device, precision)
-    more = {} if quantization is None else {"quantization": quantization}
     with preparing(device):
-        return class_of(name)(config, load, device=device, precision=precision, **more)
+        return class_of(name)(config, load, device=device, precision=precision, quantization=quantization)
 
 
 def precisions(name: str) -> tuple[Precision, ...]:
@@ -283,8 +261,11 @@ def _checked(extension: extensions.Extension) -> type[Backend]:
         cls: type[Backend] = extension.load()
     except ConfigError as error:
         raise BackendUnavailable(str(error)) from error
-    if missing := [member for member in _MEMBERS if not hasattr(cls, member)]:
-        raise BackendUnavailable(f"the {extension} is no backend: it lacks {', '.join(missing)}")
+    if not (isinstance(cls, type) and issubclass(cls, Backend)):
+        raise BackendUnavailable(f"the {extension} is no backend: it should derive from turbopi.backends.Backend")
+    lacking = [one for one in ("name", "precisions") if not hasattr(cls, one)] + sorted(cls.__abstractmethods__)
+    if lacking:
+        raise BackendUnavailable(f"the {extension} is no backend: it lacks {', '.join(lacking)}")
     if cls.name != extension.name:
         raise BackendUnavailable(f"the {extension} has the name {cls.name!r}; expected {extension.name!r}")
     return cls

@@ -1,8 +1,14 @@
-"""The protocol that every backend implements. The policy knows nothing else about the one it holds."""
+"""The base class of every backend, a way to run the model. The policy knows nothing else about the one it holds.
 
+A backend gives `name`, `precisions`, `load_weights` and `sample`. All else has a default here: what a backend can do
+besides is data on its class, and what it can't do is refused by this class, with the reason.
+"""
+
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -15,107 +21,16 @@ from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import FloatPrecision, Trace
 from turbopi.models.pi0.sample import Sample
+from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import Precision
+from turbopi.support.errors import BackendError, ConfigError, ObservationError
 
 # Loads the checkpoint's tensors, by canonical name, to a device or a room (`Checkpoint.load`) in a precision.
 LoadState = Callable[[torch.device | Room, FloatPrecision], dict[str, Tensor]]
 
 
-class Begun(Protocol):
-    """One observation whose pictures a backend works on already: what `Begins.begin` returns."""
-
-    def finish(
-        self,
-        tokens: np.ndarray,
-        state: np.ndarray,
-        noise: np.ndarray,
-        num_steps: int,
-        conditioning: Conditioning | None = None,
-    ) -> Sample:
-        """What `sample` of this one observation returns.
-
-        tokens  int64[valid prompt tokens]
-        state   float32[action_dim]
-        noise   float32[H, action_dim]
-        conditioning  of a backend that is `Conditions`, too
-        """
-
-
-class Backend(Protocol):
-    """A way to run the model. All of them compute what `turbopi.models.pi0.reference.Pi0Model` computes.
-
-    Observations and noise may be on the host or on the device; both are moved where they are needed. What only some
-    can do besides are `Begins`, `RunsBatches`, `Submits`, `Conditions` and `RunsFp8`.
-
-    any_horizon     whether noise may have another action horizon than the config's
-    strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
-                    `not_warm`. Set by the policy; a backend that does nothing of the kind needn't look
-    """
-
-    name: ClassVar[str]
-    precisions: ClassVar[tuple[Precision, ...]]
-    any_horizon: ClassVar[bool]
-    config: ModelConfig
-    device: torch.device
-    precision: Precision
-    strict: bool
-
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
-        """Load the weights; whatever can be prepared without an observation is prepared here."""
-
-    @classmethod
-    def unavailable(cls, device: torch.device) -> str | None:
-        """None if the backend can run on the device, else why it can't and what to do."""
-
-    def warmup(
-        self,
-        observation: Observation,
-        num_steps: int,
-        horizon: int | None = None,
-        *,
-        required: bool = True,
-        last: bool = True,
-    ) -> None:
-        """Compile, allocate or capture whatever later observations with so many cameras may need, and so many steps.
-
-        horizon     None: the config's
-        required    False: not if that takes the minutes of building engines, or can't be at all
-        last        whether no other cameras, steps or horizon will be warmed up, so that what that needs may be let go
-        """
-
-    def prefix(self, observation: Observation) -> KVCache:
-        """Keys and values of an observation."""
-
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
-        """Actions float32[B, H, action_dim] on the device, from noise of that shape."""
-
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        """Both halves, fused where the backend can: what the policy calls. Returns when the actions are on the host."""
-
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        """The same computation with its named intermediates (kv_k, kv_v, v_t and actions at least), for judging it."""
-
-    def describe(self) -> dict[str, Any]:
-        """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""
-
-
-@runtime_checkable
-class Begins(Protocol):
-    """A backend that can start on an observation's pictures before its prompt is known."""
-
-    def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> Begun:
-        """Start on the valid pictures, on the host.
-
-        pictures  (uint8|float32)[224, 224, 3], or of any size uint8[h, w, 3], then with
-        resize    how the device is to resize them: to the last bit what `preprocess.images.fitted` makes of them
-
-        They are copied, and `begin` returns without waiting for the device, so that the host can tokenise meanwhile. An
-        observation that never gets to `finish` is given up by the next `begin`, `sample` or `prefix`.
-        """
-
-
 class BegunBatch(Protocol):
-    """Several observations whose pictures a backend works on already: what `RunsBatches.begin_batch` returns."""
+    """Observations whose images a backend works on already: what `Backend.begin_batch` returns."""
 
     def finish(
         self,
@@ -130,65 +45,107 @@ class BegunBatch(Protocol):
         tokens  of each int64[valid prompt tokens]
         state   float32[B, action_dim]
         noise   float32[B, H, action_dim]
-        conditioning  of a backend that is `Conditions`, too: for all of them or each, of the forms that were told
+        conditioning  for all of them or each, of the forms that `begin_batch` was given
         """
 
 
-@runtime_checkable
-class RunsBatches(Protocol):
-    """A backend whose batches are sooner than their observations one by one.
+class Backend(ABC):
+    """All backends compute what `turbopi.models.pi0.reference.Pi0Model` computes.
 
-    batch_costs  how many plain observations it runs together, and how long that takes, in calls of one; other batches
-        are split into these
+    Observations and noise may be on the host or on the device; both are moved where they are needed.
+
+    name, precisions
+                    its name among the backends, and the precisions that it runs in
+    any_horizon     whether noise may have another action horizon than the config's
+    forms           what its denoising loop takes beside openpi's. A call without a conditioning, or with one of the
+                    form "plain", is the ordinary call to the last bit
+    runs_batches    whether it has `begin_batch`: it starts on images before prompts are known, and runs a batch sooner
+                    than its observations one by one
+    submits         whether it has `submit`: several observations may be in flight
+    strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
+                    `engine.cold_call.not_warm`. Set by the policy; a backend that does nothing of the kind needn't look
     """
 
-    @property
-    def batch_costs(self) -> Mapping[int, float]: ...
+    name: ClassVar[str]
+    precisions: ClassVar[tuple[Precision, ...]]
+    any_horizon: ClassVar[bool] = True
+    forms: ClassVar[tuple[Form, ...]] = ()
+    runs_batches: ClassVar[bool] = False
+    submits: ClassVar[bool] = False
+    strict = False
 
-    def begin_batch(
+    def __init__(
         self,
-        pictures: Sequence[Sequence[np.ndarray]],
-        resize: ImageResize | None = None,
-        forms: Sequence[Form] | None = None,
-    ) -> BegunBatch:
-        """`Begins.begin` of several observations: each one's valid pictures, perhaps none.
-
-        forms  of each observation's conditioning (`engine.conditioned.batch_form`), by which they are put together;
-               None: all are plain
-        """
-
-    def warmup_batches(
-        self,
-        observation: Observation,
-        num_steps: int,
-        horizon: int | None,
-        batches: Sequence[int],
-        conditioning: Conditioning | None = None,
+        config: ModelConfig,
+        load: LoadState,
+        *,
+        device: torch.device,
+        precision: Precision,
+        quantization: Quantization | None = None,
     ) -> None:
-        """Capture whatever batches of these sizes need if each observation has so many cameras as this one.
+        """quantization: the calibration of these weights, for FP8 and INT8 alone. Raises ConfigError without it."""
+        check_given(precision, quantization)
+        self.config, self.device, self.precision, self._quantization = config, device, precision, quantization
+        self.load_weights(load)
 
-        conditioning  an example, for batches with observations of its form and times beside plain ones; None: for plain
-                      ones alone
+    @abstractmethod
+    def load_weights(self, load: LoadState) -> None:
+        """Load the weights; whatever can be prepared without an observation is prepared here."""
+
+    @abstractmethod
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        """Actions float32[B, H, action_dim] from noise of that shape. Returns when they are on the host.
+
+        conditioning  one for all rows, or a list with one, or None, for each. A backend that takes none calls
+                      `check_conditioning`
         """
 
+    # -- what can be asked before there is an instance -----------------------------------------------------------------
 
-@runtime_checkable
-class Submits(Protocol):
-    """A backend that has several observations in flight."""
+    @classmethod
+    def unavailable(cls, device: torch.device) -> str | None:
+        """None if the backend can run on the device, else why it can't and what to do."""
+        return None
 
-    def submit(self, observation: Observation, noise: Tensor, num_steps: int) -> "Future[Sample]":
-        """`sample` of one observation that returns at once."""
+    @classmethod
+    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
+        """Why this precision can't run on a GPU that the backend runs on; None if it can."""
+        return None
 
+    @classmethod
+    def refuses_form(cls, form: Form) -> str | None:
+        """Why the denoising loop doesn't take a form, and what to do; None if it does."""
+        if form == "plain" or form in cls.forms:
+            return None
+        if form == "solver":
+            return (
+                f"backend {cls.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
+                "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
+            )
+        what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+        return (
+            f"backend {cls.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
+            "leave out conditioning and previous"
+        )
 
-@runtime_checkable
-class Conditions(Protocol):
-    """A backend whose denoising loop takes a `Conditioning`, of these `forms`.
+    def check_conditioning(self, conditioning: Conditionings) -> None:
+        """Raise ObservationError for a conditioning of a form that the backend doesn't have."""
+        for one in conditioning if isinstance(conditioning, Sequence) else [conditioning]:
+            if one is not None and (why := self.refuses_form(one.form)) is not None:
+                raise ObservationError(why)
 
-    A call without one, or with one of the form "plain", is the backend's ordinary call to the last bit. For a batch:
-    one for all rows, or a list with one, or None, for each. `warmup` with one prepares calls of its form and times.
-    """
+    def refuses_horizon(self, horizon: int) -> str | None:
+        """Why a call can't have this action horizon, and what to do; None if it can."""
+        if self.any_horizon or horizon == self.config.action_horizon:
+            return None
+        return (
+            f"backend {self.name!r} has engines for the config's action horizon of {self.config.action_horizon}, not "
+            f"for {horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
+        )
 
-    forms: ClassVar[tuple[Form, ...]]
+    # -- before calls --------------------------------------------------------------------------------------------------
 
     def warmup(
         self,
@@ -199,25 +156,125 @@ class Conditions(Protocol):
         required: bool = True,
         last: bool = True,
         conditioning: Conditioning | None = None,
-    ) -> None: ...
+    ) -> None:
+        """Compile, allocate or capture whatever later observations with so many cameras may need, and so many steps.
+        Here: one call.
 
-    def denoise(
-        self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
-    ) -> Tensor: ...
+        horizon       None: the config's
+        required      False: not if that takes the minutes of building engines, or can't be at all
+        last          whether no other cameras, steps or horizon will be warmed up, so that what that needs may be freed
+        conditioning  an example: calls of its form and times are prepared
+        """
+        actions = self.config.action_horizon if horizon is None else horizon
+        self.sample(observation, torch.zeros(observation.batch_size, actions, self.config.action_dim), num_steps)
 
-    def sample(
-        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
-    ) -> Sample: ...
+    def warmup_batches(  # noqa: B027  (a default, not a hole)
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None,
+        batches: Sequence[int],
+        conditioning: Conditioning | None = None,
+    ) -> None:
+        """Prepare batches of these sizes if each observation has so many cameras as this one. Here: nothing.
+
+        conditioning  an example, for batches with observations of its form and times beside plain ones; None: for plain
+                      ones alone
+        """
+
+    def describe(self) -> dict[str, Any]:
+        """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""
+        return {}
+
+    # -- calls that only some have -------------------------------------------------------------------------------------
+
+    @property
+    def batch_costs(self) -> Mapping[int, float]:
+        """How many plain observations run together, and how long that takes, in calls of one. Other batches are split
+        into these.
+        """
+        return {1: 1}
+
+    def begin_batch(
+        self,
+        images: Sequence[Sequence[np.ndarray]],
+        resize: ImageResize | None = None,
+        forms: Sequence[Form] | None = None,
+    ) -> BegunBatch:
+        """Start on the valid images of one or several observations, on the host; each may have none.
+
+        images  (uint8|float32)[224, 224, 3], or of any size uint8[h, w, 3], then with
+        resize  how the device is to resize them: to the last bit what `preprocess.images.fitted` makes of them
+        forms   of each observation's conditioning (`engine.conditioned.batch_form`), by which they are put together;
+                None: all are plain
+
+        They are copied, and `begin_batch` returns without waiting for the device, so that the host can tokenise
+        meanwhile. Observations that never get to `finish` are given up by the next call.
+        """
+        raise self._lacks("a start on images before their prompts", "call `sample`")
+
+    def submit(self, observation: Observation, noise: Tensor, num_steps: int) -> "Future[Sample]":
+        """`sample` of one observation that returns at once."""
+        raise ConfigError(
+            f"backend {self.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
+            "or submit(…, serially=True) to run it before submit returns"
+        )
+
+    # -- parts of a call, by which a backend is judged -----------------------------------------------------------------
+
+    def prefix(self, observation: Observation) -> KVCache:
+        """Keys and values of an observation."""
+        raise self._lacks("halves of a call", "call `sample`")
+
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
+        """Actions float32[B, H, action_dim] on the device, from noise of that shape."""
+        raise self._lacks("halves of a call", "call `sample`")
 
     def intermediates(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
-    ) -> Trace: ...
+    ) -> Trace:
+        """The computation of `sample` with its named intermediates (kv_k, kv_v, v_t and actions at least)."""
+        raise self._lacks("intermediate results to show", "it can't be verified")
+
+    def _lacks(self, what: str, so: str) -> BackendError:
+        return BackendError(f"backend {self.name!r} has no {what}; {so}")
 
 
-@runtime_checkable
-class RunsFp8(Protocol):
-    """A backend that has FP8 or INT8 among its precisions."""
+class StageTimer:
+    """Marks the end of each stage; the first one starts at construction. True on a GPU, too.
 
-    @classmethod
-    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
-        """Why this precision can't run on a GPU that the backend runs on; None if it can."""
+    On a GPU the marks are CUDA events and cost no synchronisation; `milliseconds` waits for the last of them.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._names: list[str] = []
+        self._marks: list[torch.cuda.Event | float] = [self._now()]
+
+    def mark(self, stage: str) -> None:
+        self._names.append(stage)
+        self._marks.append(self._now())
+
+    def milliseconds(self) -> dict[str, float]:
+        """Stage -> milliseconds since the mark before it."""
+        if not isinstance(last := self._marks[-1], float):
+            last.synchronize()  # not the device: another thread may be capturing a graph
+        return {
+            name: _elapsed_ms(start, end)
+            for name, start, end in zip(self._names, self._marks, self._marks[1:], strict=False)
+        }
+
+    def _now(self) -> "torch.cuda.Event | float":
+        if self._device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+        event.record(torch.cuda.current_stream(self._device))
+        return event
+
+
+def _elapsed_ms(start: "torch.cuda.Event | float", end: "torch.cuda.Event | float") -> float:
+    if isinstance(start, float):
+        assert isinstance(end, float)
+        return (end - start) * 1e3
+    assert not isinstance(end, float)
+    return float(start.elapsed_time(end))

@@ -5,12 +5,12 @@ What is captured, kept and refused: engine/runner.py; of batches: engine/batches
 
 import dataclasses
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Precision
+from turbopi.backends.base import Backend, LoadState, Precision
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
@@ -25,20 +25,22 @@ from turbopi.support.errors import BackendError
 from turbopi.support.toolchain import make_caches_writable
 
 
-class CudaGraphBackend(BatchRunner):
+class CudaGraphBackend(BatchRunner, Backend):
     """The engine's forward pass with PyTorch's kernels, those between products fused by Inductor if it is there."""
 
     name: ClassVar[str] = "cuda_graph"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
-    any_horizon: ClassVar[bool] = True
+    runs_batches: ClassVar[bool] = True
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
-        if config.vlm.num_kv_heads != 1:
-            raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
-        self.config, self.device, self.precision = config, device, precision
+    def __init__(self, config: ModelConfig, load: LoadState, **options: Any) -> None:
+        Backend.__init__(self, config, load, **options)
+
+    def load_weights(self, load: LoadState) -> None:
+        if (heads := self.config.vlm.num_kv_heads) != 1:
+            raise BackendError(f"{self.name} needs one key/value head, this model has {heads}")
         make_caches_writable()
         weights, ops = self._pack(load), self._make_ops()
-        super().__init__(config, weights, ops, device, joint=ops is without_compiler.OPS)
+        BatchRunner.__init__(self, self.config, weights, ops, self.device, joint=ops is without_compiler.OPS)
         self._loops: dict[tuple[int, tuple[float, ...]], without_compiler.Denoiser] = {}  # by `Loop.table`
 
     @classmethod

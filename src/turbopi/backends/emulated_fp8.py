@@ -8,16 +8,13 @@ reference, so `auto` never takes them. Everything that isn't rounded is float32 
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.config import ModelConfig
 from turbopi.engine.emulate import Round, input_rounding, put_into_norm, round_weight
 from turbopi.models.pi0.conditioning import Form
 from turbopi.models.pi0.sites import linears, norm_of
-from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites
 
@@ -29,21 +26,11 @@ class EmulatedFp8Backend(PyTorchBackend):
     precisions: ClassVar[tuple[Precision, ...]] = FP8_TIERS
     forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # rounding has no derivative
 
-    def __init__(
-        self,
-        config: ModelConfig,
-        load: LoadState,
-        *,
-        device: torch.device,
-        precision: Precision,
-        quantization: Quantization | None = None,
-    ) -> None:
-        check_given(precision, quantization)
-        assert quantization is not None  # every precision here is a tier
-        super().__init__(config, load, device=device, precision="f32")
-        self.precision = precision
-        self._quantization, self._plan = quantization, quantization.plan(config, precision)
-        for site in sites(config):
+    def load_weights(self, load: LoadState) -> None:
+        super().load_weights(load)
+        assert self._quantization is not None  # every precision here is a tier
+        self._plan = self._quantization.plan(self.config, self.precision)
+        for site in sites(self.config):
             scale = self._plan.scales.get(str(site))
             if scale is None:
                 continue
@@ -56,11 +43,8 @@ class EmulatedFp8Backend(PyTorchBackend):
                 if norm is None:
                     linear.register_forward_pre_hook(_before(rounding))
 
-    @classmethod
-    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
-        return None
-
     def describe(self) -> dict[str, Any]:
+        assert self._quantization is not None
         return {
             "attention": "explicit float32",
             self._plan.format.name: {

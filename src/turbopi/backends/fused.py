@@ -8,8 +8,9 @@ don't cover takes the engine's operations one by one. `describe()` says what run
 
 import importlib.util
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -18,17 +19,16 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.device_lost import ADVICE
+from turbopi.backends.expert_store import ExpertStore, Layers, User, layer_on
 from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
-from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.graph_cache import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
-from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops, PairDenoiser
+from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
-from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
@@ -60,30 +60,13 @@ class FusedBackend(CudaGraphBackend):
     JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _on_hopper = True  # whether kernels for compute capability 9.0 run
-    _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
-    _batches_guide_in_bf16 = False  # the same, of those guided by the true Jacobian
-    _fp8_expert: list[Any] | None = None  # layers with `ScaledMatrix`, of batches
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
-    def __init__(
-        self,
-        config: ModelConfig,
-        load: LoadState,
-        *,
-        device: torch.device,
-        precision: Precision,
-        quantization: Quantization | None = None,
-    ) -> None:
-        check_given(precision, quantization)
-        self._quantization = quantization
-        self._plan = None if quantization is None else quantization.plan(config, precision)
-        self._packed_expert: Any = None  # as the denoising kernels have it
-        self._denoisers: dict[tuple[Loop, int], Denoiser] = {}  # by loop and cache rows
-        self._pair_denoisers: dict[tuple[Loop, int], PairDenoiser] = {}  # of two observations, for batches
-        # forward, where the true Jacobian goes back; None: refused
-        self._keepers: dict[tuple[Loop, int], KeepingDenoiser | None] = {}
-        self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
-        super().__init__(config, load, device=device, precision=precision)
+    def load_weights(self, load: LoadState) -> None:
+        given = self._quantization
+        self._plan = None if given is None else given.plan(self.config, self.precision)
+        self._kernels: dict[User, Any] = {}  # denoising kernels, or why one is refused: operations denoise then
+        super().load_weights(load)
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -126,29 +109,28 @@ class FusedBackend(CudaGraphBackend):
                 if name.startswith("expert.") and what == numbers and not expert.startswith(numbers):
                     plan[name] = expert  # its kernel takes one precision
             plan["expert"] = expert
-            if self._fp8_expert is not None:
+            batches = [user.loop.form for user in list(self._expert.users["layers"]) if user.what == "batch"]
+            if self._expert.users["fp8"]:
                 plan["expert of batches"] = numbers
-            elif self._batches_denoise_in_bf16 and self._plan.expert != "bf16":
+            elif self._plan.expert != "bf16" and {*batches} - {"jacobian"}:
                 plan["expert of batches"] = "bf16, as operations denoise"
-            if self._batches_guide_in_bf16 and self._plan.expert != "bf16":
+            if self._plan.expert != "bf16" and "jacobian" in batches:
                 plan["expert of batches guided by the Jacobian"] = "bf16, as its way back is"
 
-        by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
-        by_operations: dict[str, list[str]] = {}
-        for (loop, rows), why in list(self._refused.items()):
-            kept = self._keepers.get((loop, rows)) is not None
-            how = "one CUDA kernel a step forward, operations back" if kept else f"operations, as {why}"
-            calls = by_operations.setdefault(how, [])
-            if str(loop) not in calls:
-                calls.append(str(loop))
         kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
-        described["denoising"] = ({kernel: by_kernel} if by_kernel else {}) | by_operations
-        if pairs := sorted({str(loop) for loop, _ in list(self._pair_denoisers)}):
-            described["denoising"]["one CUDA kernel for two observations"] = pairs
+        denoising = {kernel: sorted({str(loop) for loop in self._made("single")})}
+        for user, why in self._refused().items():
+            kept = user.loop in self._made("keeper")
+            how = "one CUDA kernel a step forward, operations back" if kept else f"operations, as {why}"
+            calls = denoising.setdefault(how, [])
+            if str(user.loop) not in calls:
+                calls.append(str(user.loop))
+        denoising["one CUDA kernel for two observations"] = sorted({str(loop) for loop in self._made("pair")})
+        described["denoising"] = {how: calls for how, calls in denoising.items() if calls}
         clocks = {
             str(loop): round(clock)
-            for (loop, _), kernel in list(self._denoisers.items())
-            if isinstance(kernel, Watched) and (clock := kernel.clock_mhz()) is not None
+            for loop, made in self._made("single").items()
+            if isinstance(made, Watched) and (clock := made.clock_mhz()) is not None
         }
         if clocks:
             described["denoising_clock_mhz"] = clocks
@@ -162,7 +144,31 @@ class FusedBackend(CudaGraphBackend):
             return self._plan is not None or name.startswith("expert.layers.") or is_conditioning(self.config, name)
 
         room = PackingRoom(self.config, self.device, on_host)
-        return pack(self.config, load(room, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        weights = pack(self.config, load(room, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        self._expert = ExpertStore(weights.expert, self.device, {"packed": self._packed, "fp8": self._in_fp8})
+        return weights
+
+    def _kernel(self, user: User, make: Callable[[], Any]) -> Any:
+        """What `make` makes, once; None, with the reason noted, where it raises BackendUnavailable."""
+        if user not in self._kernels:
+            try:
+                self._kernels[user] = make()
+            except BackendUnavailable as e:
+                logger.info("operations in place of a denoising kernel of %s (%s): %s", user.loop, user.what, e)
+                self._expert.release(lambda one: one == user)
+                self._kernels[user] = str(e)
+        made = self._kernels[user]
+        return None if isinstance(made, str) else made
+
+    def _made(self, what: str) -> dict[Loop, Any]:
+        """The denoising kernels of a kind, by their loop."""
+        kernels = list(self._kernels.items())  # a call of another thread may add some
+        return {user.loop: one for user, one in kernels if user.what == what and not isinstance(one, str)}
+
+    def _refused(self) -> dict[User, str]:
+        """What operations denoise of single calls, and why."""
+        kernels = list(self._kernels.items())
+        return {user: why for user, why in kernels if user.what == "single" and isinstance(why, str)}
 
     @property
     def _directions(self) -> Mapping[str, Directions]:
@@ -179,9 +185,9 @@ class FusedBackend(CudaGraphBackend):
             why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
             return f"bf16, all of it, as its kernel takes one precision; {why}"
         numbers = self._plan.expert
-        if not self._refused:
+        if not self._refused():
             return numbers
-        if not self._denoisers:
+        if not self._made("single"):
             return "bf16, as operations denoise"
         return f"{numbers} in the denoising kernel; bf16 where operations denoise"
 
@@ -197,23 +203,11 @@ class FusedBackend(CudaGraphBackend):
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
-        rows = self._most_rows(shape)
-        key = (shape.loop, rows)
-        if key not in self._denoisers and key not in self._refused:
-            try:
-                self._denoisers[key] = self._denoising_kernel(shape.loop, rows, table)
-            except BackendUnavailable as e:
-                self._refused[key] = str(e)
-        if key in self._denoisers:
-            return self._denoisers[key]
-        self._drop_unused_expert()
-        self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it
-        return None
-
-    def _drop_unused_expert(self) -> None:
-        """Let go of the packed matrices, 0.6 GB, if no kernel has them."""
-        if not any((*self._denoisers.values(), *self._pair_denoisers.values(), *self._keepers.values())):
-            self._packed_expert = None
+        user = User("single", shape.loop, self._most_rows(shape))
+        kernel: Denoiser | None = self._kernel(user, partial(self._denoising_kernel, user, table))
+        if kernel is None:
+            self._expert.use("layers", user)  # while its graph is kept, as it points to them
+        return kernel
 
     def _most_rows(self, shape: CallShape) -> int:
         """Of the cache's prefix, of all calls that one denoising kernel serves."""
@@ -222,29 +216,13 @@ class FusedBackend(CudaGraphBackend):
 
     def _make_keeper(self, shape: CallShape, table: Tensor | None) -> KeepingDenoiser | None:
         """Hopper's denoising kernel of one step, in bfloat16; None, with the reason logged, where it can't run."""
-        horizon, rows = shape.loop.horizon, self._most_rows(shape)
-        if table is None or not self._guides_by_kernel(horizon):
+        user = User("keeper", shape.loop, self._most_rows(shape))
+        if table is None or not self._guides_by_kernel(user.loop.horizon):
             return None
-        from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
-        from turbopi.kernels.sm90.denoise.packing import PackedExpert
-
-        key = (shape.loop, rows)
-        if key not in self._keepers:
-            try:
-                self._keepers[key] = DenoiseKernel(
-                    *(self.config, self._packed(PackedExpert), self._weights.small, table),
-                    cache_rows=rows,
-                    suffix=horizon,
-                    device=self.device,
-                    num_steps=1,
-                    by_token=True,
-                    keep=True,
-                )
-            except BackendUnavailable as e:
-                logger.info("operations go forward where the true Jacobian goes back: %s", e)
-                self._keepers[key] = None
-                self._drop_unused_expert()
-        return self._keepers[key]
+        kernel: KeepingDenoiser | None = self._kernel(
+            user, partial(self._hopper_kernel, user, table, num_steps=1, by_token=True, keep=True)
+        )
+        return kernel
 
     def _guides_by_kernel(self, horizon: int) -> bool:
         """Whether one call guided by the true Jacobian goes forward in Hopper's denoising kernel."""
@@ -281,56 +259,26 @@ class FusedBackend(CudaGraphBackend):
 
         The way back of the true Jacobian goes through the bfloat16 expert, as in a single call.
         """
-        if loop.form == "jacobian":
-            self._batches_guide_in_bf16 = True
-            self._keep_expert_on(self.device)
-            return self._weights
-        if loop.form != "plain":
-            return self._batch_weights()
-        if batch != 2 or not self._denoises_pairs(loop.horizon):
-            return self._batch_weights()
-        key = (loop, rows)
-        if key not in self._pair_denoisers:
-            try:
-                self._pair_denoisers[key] = self._pair_kernel(loop, rows)
-            except BackendUnavailable as e:  # more keys than fit, or fewer multiprocessors than it needs
-                logger.info("operations denoise two observations: %s", e)
-                return self._batch_weights()
-        return self._pair_denoisers[key]
+        if loop.form == "plain" and batch == 2 and self._denoises_pairs(loop.horizon):
+            table, user = self._table(loop), User("pair", loop, rows)
+            assert table is not None, "the kernel takes Pi0.5 alone"
+            pair: PairDenoiser | None = self._kernel(user, partial(self._hopper_kernel, user, table, pair=True))
+            if pair is not None:
+                return pair
+        in_fp8 = self._plan is not None and self._plan.expert == "fp8" and loop.form != "jacobian"
+        layers = self._expert.use("fp8" if in_fp8 else "layers", User("batch", loop, rows))
+        return replace(self._weights, expert=layers)
 
-    def _pair_kernel(self, loop: Loop, rows: int) -> PairDenoiser:
-        """Raises BackendUnavailable where it can't run."""
-        from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
-        from turbopi.kernels.sm90.denoise.packing import PackedExpert
+    def _in_fp8(self, layers: Layers) -> list[GemmaLayer[Matrix]]:
+        """The expert's layers on the device, as operations multiply in FP8."""
 
-        table = self._table(loop)
-        assert table is not None, "the kernel takes Pi0.5 alone"
-        kernel = DenoiseKernel(
-            *(self.config, self._packed(PackedExpert), self._weights.small, table),
-            cache_rows=rows,
-            suffix=2 * loop.horizon,
-            device=self.device,
-            pair=True,
-        )
-        self._put_expert_away()
-        return kernel
+        def quantized(number: int, layer: GemmaLayer[Tensor]) -> GemmaLayer[Matrix]:
+            made: Any = {
+                kind: self._quantized(f"expert.{number}.{kind}", getattr(layer, kind)) for kind in KINDS["expert"]
+            }
+            return replace(layer, **made)
 
-    def _batch_weights(self) -> Weights:
-        """Operations denoise batches: where the denoising kernel runs in FP8, they do, else in bfloat16."""
-        if self._plan is None or self._plan.expert != "fp8":
-            self._batches_denoise_in_bf16 = True
-            self._keep_expert_on(self.device)
-            return self._weights
-        if self._fp8_expert is None:
-            self._keep_expert_on(self.device)
-            self._fp8_expert = []
-            for i, layer in enumerate(self._weights.expert):
-                made: dict[str, Any] = {
-                    kind: self._quantized(f"expert.{i}.{kind}", getattr(layer, kind)) for kind in KINDS["expert"]
-                }
-                self._fp8_expert.append(replace(layer, **made))
-            self._put_expert_away()
-        return replace(self._weights, expert=self._fp8_expert)
+        return [quantized(number, layer_on(layer, self.device)) for number, layer in enumerate(layers)]
 
     def _quantized(self, place: str, matrix: Tensor) -> Matrix:
         if self._plan is None or place not in self._plan.scales:
@@ -339,46 +287,45 @@ class FusedBackend(CudaGraphBackend):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        kept: dict[tuple[Loop, int], Any]
-        for kept in (self._denoisers, self._pair_denoisers, self._keepers, self._refused):
-            for key in [key for key in kept if key[0] == loop]:
-                del kept[key]
-        if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
-            self._put_expert_away()
+        for user in [user for user in self._kernels if user.loop == loop]:
+            del self._kernels[user]
+        self._expert.release(lambda user: user.loop == loop)
 
-    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
+    def _denoising_kernel(self, user: User, table: Tensor | None) -> Denoiser:
         """Raises BackendUnavailable for what it doesn't cover."""
-        kernel = self._hopper_kernel(loop, rows, table) if self._on_hopper else self._portable_kernel(loop, rows, table)
-        self._put_expert_away()
-        return kernel
+        if self._on_hopper:
+            from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, unavailable
+            from turbopi.kernels.sm90.denoise.packing import refusal
 
-    def _hopper_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
-        from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
-        from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
+            table = self._covered(unavailable(self.device) or refusal(self.config), user.loop, MAX_SUFFIX, table)
+            by_token = {} if user.loop.form == "plain" else {"num_steps": user.loop.steps, "by_token": True}
+            denoiser: Denoiser = self._hopper_kernel(user, table, **by_token)
+            return denoiser
+        return self._portable_kernel(user, table)
 
-        table = self._covered(unavailable(self.device) or refusal(self.config), loop, MAX_SUFFIX, table)
-        by_token = loop.form != "plain"
+    def _hopper_kernel(self, user: User, table: Tensor, **options: Any) -> Any:
+        from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
+
         return DenoiseKernel(
-            *(self.config, self._packed(PackedExpert), self._weights.small, table),
-            cache_rows=rows,
-            suffix=loop.horizon,
+            *(self.config, self._expert.use("packed", user), self._weights.small, table),
+            cache_rows=user.rows,
+            suffix=user.loop.horizon * (2 if user.what == "pair" else 1),
             device=self.device,
-            num_steps=loop.steps if by_token else None,
-            by_token=by_token,
+            **options,
         )
 
-    def _portable_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
+    def _portable_kernel(self, user: User, table: Tensor | None) -> Denoiser:
         from turbopi.kernels.portable.denoise.kernel import MAX_SUFFIX, PortableDenoiser, unavailable
-        from turbopi.kernels.portable.denoise.packing import PackedExpert, refusal
+        from turbopi.kernels.portable.denoise.packing import refusal
 
         weights = "bf16" if self._plan is None else self._plan.expert
-        table = self._covered(unavailable(self.device, weights) or refusal(self.config), loop, MAX_SUFFIX, table)
-        if loop.form != "plain":
+        table = self._covered(unavailable(self.device, weights) or refusal(self.config), user.loop, MAX_SUFFIX, table)
+        if user.loop.form != "plain":
             raise BackendUnavailable("the portable denoising kernel has one time for all actions")
         return PortableDenoiser(
-            *(self.config, self._packed(PackedExpert), self._weights.small, table),
-            cache_rows=rows,
-            suffix=loop.horizon,
+            *(self.config, self._expert.use("packed", user), self._weights.small, table),
+            cache_rows=user.rows,
+            suffix=user.loop.horizon,
             device=self.device,
         )
 
@@ -392,35 +339,25 @@ class FusedBackend(CudaGraphBackend):
             raise BackendUnavailable(reason or "there is no modulation")
         return table
 
-    def _packed(self, kind: Any) -> Any:
-        """The expert's matrices as a denoising kernel has them."""
-        if self._packed_expert is None:
-            int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
-            self._packed_expert = kind.pack(
-                self.config,
-                self._weights.expert,
-                inputs=self._expert_inputs(),
-                directions=self._directions,
-                device=self.device,
-                **({"format": INT8} if int8 else {}),
-            )
-        return self._packed_expert
+    def _packed(self, layers: Layers) -> Any:
+        """The expert's matrices as the denoising kernels have them."""
+        from turbopi.kernels.portable.denoise.packing import PackedExpert as Portable
+        from turbopi.kernels.sm90.denoise.packing import PackedExpert as Hopper
+
+        kind: Any = Hopper if self._on_hopper else Portable
+        int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
+        return kind.pack(
+            self.config,
+            layers,
+            inputs=self._expert_inputs(),
+            directions=self._directions,
+            device=self.device,
+            **({"format": INT8} if int8 else {}),
+        )
 
     def _explain(self, error: RuntimeError) -> None:
-        for kernel in (*self._denoisers.values(), *self._pair_denoisers.values(), *self._keepers.values()):
+        for kernel in self._kernels.values():
             if isinstance(kernel, Watched) and (why := kernel.why_it_trapped()) is not None:
                 raise DeviceLost(
                     f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"
                 ) from error
-
-    def _put_expert_away(self) -> None:
-        """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
-        if not (self._refused or self._batches_denoise_in_bf16 or self._batches_guide_in_bf16):
-            self._keep_expert_on(HOST)
-
-    def _keep_expert_on(self, device: torch.device) -> None:
-        layers = self._weights.expert
-        for i, layer in enumerate(layers):
-            if layer.qkv.device != device:
-                tensors = {name: value for name, value in vars(layer).items() if value is not None}
-                layers[i] = replace(layer, **{name: tensor.to(device) for name, tensor in tensors.items()})

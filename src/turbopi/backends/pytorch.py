@@ -2,60 +2,34 @@
 
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
-from turbopi.backends.base import Backend, LoadState, Precision, Sample
-from turbopi.backends.timing import StageTimer
-from turbopi.config import ModelConfig
+from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.conditioning import Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, Trace
+from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.support.errors import BackendError
 
 
-class PyTorchBackend:
+class PyTorchBackend(Backend):
     """Runs `Pi0Model`; a batch of one is compacted exactly, larger ones as far as their masks allow."""
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
-    any_horizon: ClassVar[bool] = True
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
-    strict = False  # nothing here depends on shapes
+    _warm = False
 
-    def __init__(
-        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
-    ) -> None:
-        self.config = config
-        self.device = device
-        self.precision: Precision = precision
-        self._warm = False
-        self.model = self.model_class.from_state(config, load(device, precision))
+    def load_weights(self, load: LoadState) -> None:
+        precision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
+        self.model = self.model_class.from_state(self.config, load(self.device, precision))
 
-    @classmethod
-    def unavailable(cls, device: torch.device) -> str | None:
-        return None
-
-    def warmup(
-        self,
-        observation: Observation,
-        num_steps: int,
-        horizon: int | None = None,
-        *,
-        required: bool = True,
-        last: bool = True,
-        conditioning: Conditioning | None = None,
-    ) -> None:
+    def warmup(self, *arguments: Any, **options: Any) -> None:
         """One call: it loads libraries and fills allocators; other shapes need nothing more."""
         if not self._warm:
-            self._one_call(observation, num_steps, horizon)
+            super().warmup(*arguments, **options)
         self._warm = True
-
-    def _one_call(self, observation: Observation, num_steps: int, horizon: int | None) -> None:
-        actions = self.config.action_horizon if horizon is None else horizon
-        self.sample(observation, torch.zeros(observation.batch_size, actions, self.config.action_dim), num_steps)
 
     def prefix(self, observation: Observation) -> KVCache:
         return self.model.prefix(observation.to(self.device))

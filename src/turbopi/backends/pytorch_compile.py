@@ -13,13 +13,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.base import Backend, LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.cold_call import not_warm
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
-from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
+from turbopi.models.pi0.conditioning import Conditionings, Form
+from turbopi.models.pi0.reference import Pi0Model
 from turbopi.support.errors import BackendError, BackendUnavailable, ObservationError
 from turbopi.support.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
 
@@ -112,37 +112,26 @@ class PyTorchCompileBackend(PyTorchBackend):
     forms: ClassVar[tuple[Form, ...]] = ()  # each would be compiled anew, for a minute
     model_class: ClassVar[type[Pi0Model]] = CompiledModel
 
-    def __init__(
-        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
-    ) -> None:
+    def load_weights(self, load: LoadState) -> None:
         if torch._dynamo.config.disable:
             raise BackendUnavailable("torch.compile is switched off by torch._dynamo.config.disable")
         make_caches_writable()
-        super().__init__(config, load, device=device, precision=precision)
+        super().load_weights(load)
         self._compiled: set[Compiled] = set()
         self._warming = False
 
-    def warmup(
-        self,
-        observation: Observation,
-        num_steps: int,
-        horizon: int | None = None,
-        *,
-        required: bool = True,
-        last: bool = True,
-        conditioning: Conditioning | None = None,
-    ) -> None:
+    def warmup(self, *arguments: Any, **options: Any) -> None:
         """One call with as many cameras, which compiles for them."""
         self._warming = True
         try:
-            self._one_call(observation, num_steps, horizon)
+            Backend.warmup(self, *arguments, **options)
         finally:
             self._warming = False
 
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        assert conditioning is None, "there are no `forms`"
+        self.check_conditioning(conditioning)
         shape = Compiled.of(observation, noise.shape[1])
         if self.strict and not self._warming and shape not in self._compiled:
             warm = map(str, self._compiled)

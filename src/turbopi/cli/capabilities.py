@@ -26,7 +26,6 @@ class Offers:
 def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
     """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
     from turbopi import backends
-    from turbopi.backends.abilities import Abilities
     from turbopi.policy.call_options import Denoising
     from turbopi.policy.chunk_conditioning import Joining
 
@@ -34,14 +33,14 @@ def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     name = backends.choose(device, precision)[0] if fitting.backend == "auto" else fitting.backend  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
-    kind: Any = backends.class_of(name)  # a class has its instances' capabilities
+    cls = backends.class_of(name)
     asked = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
     no_pipeline: Any = None  # no observation is read
-    modes = Joining(checkpoint.config, no_pipeline, Abilities(kind), asked.integration).modes
-    batches = isinstance(kind, backends.RunsBatches) and (asked.integration is None or asked.integration.is_euler)
+    modes = Joining(checkpoint.config, no_pipeline, cls, asked.integration).modes
+    batches = cls.runs_batches and (asked.integration is None or asked.integration.is_euler)
     return Offers(
         real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},
-        pipelined=isinstance(kind, backends.Submits),
+        pipelined=cls.submits,
         batch_modes=modes if batches else (),
     )
 

@@ -56,7 +56,7 @@ class BegunBatch:
         num_steps: int,
         conditioning: Conditionings = None,
     ) -> Sample:
-        """See `turbopi.backends.base.RunsBatches`."""
+        """See `turbopi.backends.base.BegunBatch`."""
         asked, samples = of_rows(conditioning, len(tokens)), []
         check_rows(asked, num_steps, *noise.shape[1:])
         if len(self._calls) == 1:  # of all, in their order
@@ -98,7 +98,7 @@ class BatchRunner(GraphRunner):
 
     @property
     def batch_costs(self) -> Mapping[int, float]:
-        """See `turbopi.backends.base.RunsBatches`."""
+        """See `turbopi.backends.base.Backend`."""
         return self.COSTS
 
     @property
@@ -114,7 +114,7 @@ class BatchRunner(GraphRunner):
         batches: Sequence[int],
         conditioning: Conditioning | None = None,
     ) -> None:
-        """See `turbopi.backends.base.RunsBatches`."""
+        """See `turbopi.backends.base.Backend`."""
         cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
         form, actions = batch_form(conditioning), self.config.action_horizon if horizon is None else horizon
         if form == "solver":  # they run alone
@@ -138,7 +138,7 @@ class BatchRunner(GraphRunner):
         resize: ImageResize | None = None,
         forms: Sequence[Form] | None = None,
     ) -> BegunBatch:
-        """See `turbopi.backends.base.RunsBatches`."""
+        """See `turbopi.backends.base.Backend`."""
         for one in pictures:
             self._check_cameras(len(one))
         float_images = floats([picture for one in pictures for picture in one], resize)
@@ -195,6 +195,8 @@ class BatchRunner(GraphRunner):
 
     def _calls_of(self, forms: Sequence[Form]) -> list[Call]:
         """The calls that a batch of observations of these forms is split into; strict: of those that are captured."""
+        if len(forms) == 1:
+            return [(1, [0])]
         calls: list[Call] = []
         for form, rows in _groups(forms):
             for bucket in [1] * len(rows) if form == "solver" else self._split(len(rows), form):

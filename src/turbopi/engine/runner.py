@@ -75,7 +75,7 @@ class Begun:
         num_steps: int,
         conditioning: Conditioning | None = None,
     ) -> Sample:
-        """See `turbopi.backends.base.Begins`."""
+        """Its actions: `turbopi.backends.base.BegunBatch` of one observation, given without the axis of the batch."""
         call, graph = self._runner._continue(self, "answer", tokens, state, noise, num_steps, conditioning)
         return Sample(torch.from_numpy(call.actions_array[None].copy()), graph.stage_ms())
 
@@ -169,7 +169,7 @@ class GraphRunner:
         return call.x_t[-1:].clone()
 
     def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> Begun:
-        """See `turbopi.backends.base.Begins`. One observation at a time: this ends the turn of the one before."""
+        """`BatchRunner.begin_batch` of one observation. One at a time: this ends the turn of the one before."""
         self._check_cameras(len(pictures))
         begun = Begun(self, len(pictures), floats(pictures, resize))
         buffers = self._pictures_of(begun.cameras, begun.float_images)

@@ -6,11 +6,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from turbopi.backends.abilities import Abilities
+from turbopi.backends import Backend
 from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.engine.conditioned import batch_form
 from turbopi.models.pi0.conditioning import (
     Conditioning,
+    Conditionings,
     Form,
     Guidance,
     TokenTimes,
@@ -50,7 +51,7 @@ class Joins:
 
 
 class Joining:
-    """Of one policy; `able` is its backend, `integration` how it denoises unless a call says otherwise.
+    """Of one policy; `backend` is its own or its class, `integration` how it denoises unless a call says otherwise.
 
     Raises ConfigError for an integration that the backend doesn't have.
     """
@@ -59,24 +60,20 @@ class Joining:
         self,
         config: PolicyConfig,
         pipeline: Pipeline,
-        able: Abilities,
+        backend: Backend | type[Backend],
         integration: Integration | None = None,
     ) -> None:
-        self._config, self._model, self._pipeline, self._able = config, config.model, pipeline, able
+        self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
         self._integration = integration
-        if integration is not None:
-            try:
-                self._check_form("solver")
-            except ObservationError as error:
-                raise ConfigError(str(error)) from None
+        if integration is not None and (why := backend.refuses_form("solver")) is not None:
+            raise ConfigError(why)
 
     @property
     def modes(self) -> tuple[JoinMode, ...]:
         """What `RunningChunk`s may ask of this policy."""
         if self._integration is not None and not self._integration.is_euler:
             return ()  # see `Conditioning`
-        able = self._able.forms
-        trained = self._config.real_time.trained_max_delay > 0
+        able, trained = self._backend.forms, self._config.real_time.trained_max_delay > 0
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
     def checked(
@@ -127,10 +124,10 @@ class Joining:
             self._check_form(FORMS[previous.mode])
         return conditioning, previous
 
-    def arguments(self, joins: Joins, states: Sequence[np.ndarray]) -> dict[str, Any]:
+    def conditioning(self, joins: Joins, states: Sequence[np.ndarray]) -> Conditionings:
         """What the backend is given beside the noise, once the new states are known. Raises ObservationError.
 
-        {} for an ordinary call, else "conditioning": one for all observations, or a list with one for each.
+        None for an ordinary call, else one for all observations, or a list with one for each.
         """
         rows: list[Conditioning | None] = []
         for i, ((one, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
@@ -138,9 +135,7 @@ class Joining:
                 with row_named(i, len(states)):
                     one = self._of_chunk(chunk, state, joins)
             rows.append(None if one is None or one.form == "plain" else one)
-        if all(one is rows[0] for one in rows):
-            return {} if rows[0] is None else {"conditioning": rows[0]}
-        return {"conditioning": rows}
+        return rows[0] if all(one is rows[0] for one in rows) else rows
 
     def _of_chunk(self, chunk: RunningChunk, state: np.ndarray, joins: Joins) -> Conditioning:
         steps, horizon, integration = joins.steps, joins.horizon, joins.integration
@@ -190,18 +185,8 @@ class Joining:
         return asked
 
     def _check_form(self, form: Form) -> None:
-        if form != "plain" and form not in self._able.forms:
-            backend = self._able.backend
-            what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
-            if form == "solver":
-                raise ObservationError(
-                    f"backend {backend.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
-                    "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
-                )
-            raise ObservationError(
-                f"backend {backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
-                "leave out conditioning and previous"
-            )
+        if (why := self._backend.refuses_form(form)) is not None:
+            raise ObservationError(why)
 
 
 def integrated(conditioning: Conditioning | None, integration: Integration | None) -> Conditioning | None:

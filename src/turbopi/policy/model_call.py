@@ -1,6 +1,6 @@
 """The middle of a policy's call: observations to model inputs, and on to what the backend makes of them.
 
-A backend that can starts on the pictures first, and prompts are tokenised beside it.
+A backend that can starts on the images first, and prompts are tokenised meanwhile.
 """
 
 import threading
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from turbopi import backends
-from turbopi.backends.abilities import Abilities
 from turbopi.backends.device_lost import Guard
 from turbopi.models.observation import Observation
 from turbopi.policy.chunk_conditioning import Joining, Joins
@@ -34,8 +33,8 @@ class Ran:
 class ModelCall:
     """Of one policy, by the backend that it holds. One call at a time: others wait for `lock`."""
 
-    def __init__(self, pipeline: Pipeline, joining: Joining, able: Abilities, guard: Guard) -> None:
-        self._pipeline, self._joining, self._able, self._guard = pipeline, joining, able, guard
+    def __init__(self, pipeline: Pipeline, joining: Joining, backend: backends.Backend, guard: Guard) -> None:
+        self._pipeline, self._joining, self._backend, self._guard = pipeline, joining, backend, guard
         self.lock = threading.Lock()
 
     def run(
@@ -45,50 +44,28 @@ class ModelCall:
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
     ) -> Ran:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        able = self._able
-        if len(observations) == 1 and able.begins is not None:
-            return self._begin(able.begins, observations[0], joins, noise)
-        if able.runs_batches is not None:
-            return self._begin_batch(able.runs_batches, observations, joins, noise)
+        if self._backend.runs_batches:
+            return self._begin(observations, joins, noise)
         prepared = [self._pipeline.before(obs) for obs in observations]
         inputs, states = Observation.stack([one for one, _ in prepared]), [state for _, state in prepared]
-        x_1, arguments = torch.from_numpy(noise()), self._joining.arguments(joins, states)
+        x_1, conditioning = torch.from_numpy(noise()), self._joining.conditioning(joins, states)
         asked = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
-            sample = able.backend.sample(inputs, x_1, joins.steps, **arguments)
+            sample = self._backend.sample(inputs, x_1, joins.steps, conditioning=conditioning)
             return Ran(sample, states, asked, infer_start, time.perf_counter())
 
-    def _begin(
-        self, backend: backends.Begins, observation: Mapping[str, Any], joins: Joins, noise: Callable[[], np.ndarray]
-    ) -> Ran:
-        seen = self._pipeline.see(observation, resize=False)
-        asked = time.perf_counter()
-        with self.lock, self._guard:
-            infer_start = time.perf_counter()
-            begun = backend.begin(seen.pictures, self._pipeline.config.image_resize)
-            self._pipeline.read(seen)  # while the device is at the pictures
-            x_1, arguments = noise()[0], self._joining.arguments(joins, [seen.state])
-            sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, joins.steps, **arguments)
-            return Ran(sample, [seen.state], asked, infer_start, time.perf_counter())
-
-    def _begin_batch(
-        self,
-        backend: backends.RunsBatches,
-        observations: Sequence[Mapping[str, Any]],
-        joins: Joins,
-        noise: Callable[[], np.ndarray],
-    ) -> Ran:
+    def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
         each = [self._pipeline.see(obs, resize=False) for obs in observations]
         asked = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
-            pictures, resize = [seen.pictures for seen in each], self._pipeline.config.image_resize
-            batch = backend.begin_batch(pictures, resize, joins.forms)
+            images, resize = [seen.pictures for seen in each], self._pipeline.config.image_resize
+            begun = self._backend.begin_batch(images, resize, joins.forms)
             for seen in each:
-                self._pipeline.read(seen)  # while the device is at the first ones' pictures
+                self._pipeline.read(seen)  # while the device is at the first ones' images
             x_1, states = noise(), [seen.state for seen in each]
-            arguments = self._joining.arguments(joins, states)
-            tokens, state = [seen.tokens[seen.token_mask] for seen in each], [seen.model_state for seen in each]
-            sample = batch.finish(tokens, np.stack(state), x_1, joins.steps, **arguments)
+            conditioning = self._joining.conditioning(joins, states)
+            tokens, state = [seen.tokens[seen.token_mask] for seen in each], np.stack([one.model_state for one in each])
+            sample = begun.finish(tokens, state, x_1, joins.steps, conditioning)
             return Ran(sample, states, asked, infer_start, time.perf_counter())

@@ -13,7 +13,6 @@ import torch
 
 from turbopi import backends
 from turbopi.backends import Precision
-from turbopi.backends.abilities import Abilities
 from turbopi.backends.device_lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
@@ -135,9 +134,8 @@ class UnifiedPolicy:
                 name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
-        able = Abilities(self.backend)
-        self._joining = Joining(self.config, self._pipeline, able, self._denoising.integration)
-        self._call = ModelCall(self._pipeline, self._joining, able, self._guard)
+        self._joining = Joining(self.config, self._pipeline, self.backend, self._denoising.integration)
+        self._call = ModelCall(self._pipeline, self._joining, self.backend, self._guard)
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint
@@ -276,12 +274,7 @@ class UnifiedPolicy:
         For the pipelined backends, which encode one observation while another is denoised. Other backends raise
         ConfigError, unless `serially` says that running it now, before returning, will do.
         """
-        if not isinstance(self.backend, backends.Submits):
-            if not serially:
-                raise ConfigError(
-                    f"backend {self.backend.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
-                    "or submit(…, serially=True) to run it before submit returns"
-                )
+        if serially and not self.pipelined:
             done: Future[dict[str, Any]] = Future()
             done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps, horizon=horizon))
             return done
@@ -371,9 +364,9 @@ class UnifiedPolicy:
                     horizon,
                     required=cameras is not None or count == own,
                     last=i + 1 == len(plan),
-                    **({} if one is None else {"conditioning": one}),
+                    conditioning=one,
                 )
-                if sizes and isinstance(self.backend, backends.RunsBatches):
+                if sizes:
                     self.backend.warmup_batches(Observation.stack([seen]), num_steps, horizon, sizes, one)
         if own in counts:
             self._whole_call(example, *loops[0])
@@ -406,7 +399,7 @@ class UnifiedPolicy:
     def runs_batches(self) -> bool:
         """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
         integration = self._denoising.integration
-        return isinstance(self.backend, backends.RunsBatches) and (integration is None or integration.is_euler)
+        return self.backend.runs_batches and (integration is None or integration.is_euler)
 
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:
@@ -425,7 +418,7 @@ class UnifiedPolicy:
     @property
     def pipelined(self) -> bool:
         """Whether `submit` overlaps observations; the server uses it then."""
-        return isinstance(self.backend, backends.Submits)
+        return self.backend.submits
 
     @property
     def pipeline(self) -> Pipeline:
@@ -463,12 +456,8 @@ class UnifiedPolicy:
         return own if horizon is None else self._checked_horizon(horizon, ObservationError)
 
     def _checked_horizon(self, horizon: int, error: type[ConfigError] | type[ObservationError]) -> int:
-        own = self.config.model.action_horizon
-        if checked_horizon(horizon, error) != own and not self.backend.any_horizon:
-            raise error(
-                f"backend {self.backend.name!r} has engines for the config's action horizon of {own}, not for "
-                f"{horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
-            )
+        if (why := self.backend.refuses_horizon(checked_horizon(horizon, error))) is not None:
+            raise error(why)
         return int(horizon)
 
     def _noise(self, batch: int, horizon: int, noise: Any, seed: int | Sequence[int] | None) -> np.ndarray:

@@ -12,16 +12,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Precision, Sample
+from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
 from turbopi.backends.onnx.cache import kept_export
 from turbopi.backends.onnx.export import EXPORT_NEEDS, missing_library
-from turbopi.backends.timing import StageTimer
 from turbopi.checkpoint.onnx_folder import GRAPHS, Export, GraphsOnly, open_export
-from turbopi.config import ModelConfig
 from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditionings
 from turbopi.models.pi0.denoise import euler_step, time_embedding, time_grid
 from turbopi.models.pi0.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
-from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, Trace
+from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.models.pi0.vision import normalize_images
 from turbopi.support.errors import CheckpointError, ObservationError
 
@@ -57,7 +56,7 @@ class Sessions:
         return [torch.from_numpy(output) for output in outputs]
 
 
-class OnnxBackend:
+class OnnxBackend(Backend):
     """Runs the export of the weights, which is kept for the next start, or a folder that was exported before.
 
     That folder is opened as a checkpoint, or with `open`.
@@ -65,15 +64,11 @@ class OnnxBackend:
 
     name: ClassVar[str] = "onnx"
     precisions: ClassVar[tuple[Precision, ...]] = ("f32",)
-    any_horizon: ClassVar[bool] = True
-    strict = False  # nothing here depends on shapes
 
-    def __init__(
-        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
-    ) -> None:
-        began = time.perf_counter()
+    def load_weights(self, load: LoadState) -> None:
+        began, config = time.perf_counter(), self.config
         try:
-            model = Pi0Model.from_state(config, load(device, precision))
+            model = Pi0Model.from_state(config, load(self.device, "f32"))
         except GraphsOnly as exported:
             self._use(open_export(exported.folder))
             self.config = config  # the graphs' sizes; horizon and time grid as the folder's turbopi.json says
@@ -102,28 +97,20 @@ class OnnxBackend:
             return "it runs ONNX Runtime's CPU provider; use device 'cpu'"
         return missing_library((*EXPORT_NEEDS, "onnxruntime"))
 
-    def warmup(
-        self,
-        observation: Observation,
-        num_steps: int,
-        horizon: int | None = None,
-        *,
-        required: bool = True,
-        last: bool = True,
-    ) -> None:
-        actions = self.config.action_horizon if horizon is None else horizon
-        self.sample(observation, torch.zeros(observation.batch_size, actions, self.config.action_dim), num_steps)
-
     def prefix(self, observation: Observation) -> KVCache:
         caches = [self._keys_values(self._embed(row)) for row in _rows(observation.to(self.device))]
         return caches[0] if len(caches) == 1 else _batched(caches)
 
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
+        self.check_conditioning(conditioning)
         noise = noise.to(self.device)
         rows = range(noise.shape[0])
         return torch.cat([self._denoise(_row_of(cache, b), noise[b : b + 1], num_steps) for b in rows])
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        self.check_conditioning(conditioning)
         noise = noise.to(self.device)
         timer = StageTimer(self.device)
         embedded = [self._embed(row) for row in _rows(observation.to(self.device))]
@@ -134,7 +121,10 @@ class OnnxBackend:
         timer.mark("denoise")
         return Sample(torch.cat(actions), timer.milliseconds())
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
+        self.check_conditioning(conditioning)
         traces: list[Trace] = []
         for b, row in enumerate(_rows(observation.to(self.device))):
             trace: Trace = {}

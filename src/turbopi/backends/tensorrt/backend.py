@@ -19,19 +19,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.base import Backend, LoadState, Sample
 from turbopi.backends.tensorrt import library, missing
 from turbopi.backends.tensorrt.call import EngineCall
 from turbopi.backends.tensorrt.engines import ModelEngines, for_this_gpu, without_engine_weights
 from turbopi.backends.tensorrt.networks import Fp8Scales
 from turbopi.backends.tensorrt.parts import SLOTS, EngineShape, fingerprint
-from turbopi.config import ModelConfig
 from turbopi.engine.cold_call import not_warm
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.graph_cache import Loop, RecentLoops
 from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import FloatPrecision, Trace
 from turbopi.support.errors import BackendError, ObservationError
@@ -67,23 +67,19 @@ class CallKey:
     buffers: int = 0  # which of several sets of buffers
 
 
-class TensorRTBackend:
+class TensorRTBackend(Backend):
     """See the top of this file. Batches run one observation after the other."""
 
     name: ClassVar[str] = "tensorrt"
     precisions: ClassVar[tuple[FloatPrecision, ...]] = ("bf16",)
     any_horizon: ClassVar[bool] = False  # engines are built for one
-    strict = False
 
-    def __init__(
-        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
-    ) -> None:
-        if config.vlm.num_kv_heads != 1:
-            raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
-        self.config, self.device, self.precision = config, device, precision
-        state = load(device, precision)
+    def load_weights(self, load: LoadState) -> None:
+        if (heads := self.config.vlm.num_kv_heads) != 1:
+            raise BackendError(f"{self.name} needs one key/value head, this model has {heads}")
+        state = load(self.device, "f32" if self.precision == "f32" else "bf16")
         self._weights_hash = fingerprint(state)
-        self._weights = pack(config, state)
+        self._weights = pack(self.config, state)
         self._engines = self._make_engines(self._weights)
         self._sealed, self._missed = False, 0
         self._shapes: list[EngineShape] = []  # whose engines are loaded
@@ -105,7 +101,7 @@ class TensorRTBackend:
             return f"it needs compute capability 8.0 or newer for bfloat16, this GPU has {major}.{minor}"
         return None
 
-    # -- the protocol --------------------------------------------------------------------------------------------------
+    # -- the base class's methods --------------------------------------------------------------------------------------
 
     def warmup(
         self,
@@ -115,6 +111,7 @@ class TensorRTBackend:
         *,
         required: bool = True,
         last: bool = True,
+        conditioning: Conditioning | None = None,
     ) -> None:
         """Load every cached set of engines for this observation's cameras, and capture; allow no other shape after the
         last one.
@@ -122,6 +119,7 @@ class TensorRTBackend:
         Builds a set for the model's longest prompt where none is cached that holds this observation's prompt, unless it
         isn't required.
         """
+        self.check_conditioning(conditioning)
         row, actions = self._row(observation, 0), self.config.action_horizon if horizon is None else horizon
         cameras = len(row.images)
         self._warming = True
@@ -155,7 +153,8 @@ class TensorRTBackend:
         lengths = torch.tensor([length], device=self.device)
         return KVCache(k, v, None, lengths, observation.state.to(self.device))
 
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
+        self.check_conditioning(conditioning)
         if cache.k.shape[1] != 1 or cache.mask is not None:
             raise BackendError(f"{self.name} denoises one unpadded observation's cache, not {cache.k.shape[1]}")
         length, per_image = cache.k.shape[3], self.config.vision.num_tokens
@@ -172,7 +171,10 @@ class TensorRTBackend:
         graph.replay()
         return call.x_t[-1:].clone()
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        self.check_conditioning(conditioning)
         actions, stages = [], []
         for b in range(observation.batch_size):
             call, graph = self._run("call", self._row(observation, b), noise[b].cpu().numpy(), num_steps)
@@ -180,7 +182,10 @@ class TensorRTBackend:
             stages.append(graph.stage_ms())
         return Sample(torch.stack(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
+        self.check_conditioning(conditioning)
         traces = []
         for b in range(observation.batch_size):
             row = self._row(observation, b)

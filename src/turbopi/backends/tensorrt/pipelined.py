@@ -21,10 +21,10 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample
 from turbopi.backends.tensorrt.backend import CallKey, TensorRTBackend
-from turbopi.config import ModelConfig
 from turbopi.engine.graph import Graph
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.reference import FloatPrecision, Trace
+from turbopi.models.pi0.conditioning import Conditionings
+from turbopi.models.pi0.reference import Trace
 from turbopi.support.errors import BackendError
 
 BUFFERS = 2
@@ -49,11 +49,10 @@ class TensorRTPipelinedBackend(TensorRTBackend):
     """`submit` returns at once; `sample` is `submit` and its answer."""
 
     name: ClassVar[str] = "tensorrt_pipelined"
+    submits: ClassVar[bool] = True
 
-    def __init__(
-        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
-    ) -> None:
-        super().__init__(config, load, device=device, precision=precision)
+    def load_weights(self, load: LoadState) -> None:
+        super().load_weights(load)
         self._slots = [_InFlight() for _ in range(BUFFERS)]
         self._next = 0
         self._submitting = threading.Lock()
@@ -93,7 +92,10 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         self._collect(_Job(wait, collect, future, slot))
         return future
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        self.check_conditioning(conditioning)
         rows = [self.submit(_row(observation, b), noise[b : b + 1], num_steps) for b in range(observation.batch_size)]
         samples = [row.result() for row in rows]
         stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
@@ -103,9 +105,9 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         with self._submitting, _all_free(self._slots):  # graphs may be captured, and others forgotten
             super().warmup(*arguments, **options)
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+    def intermediates(self, *arguments: Any, **options: Any) -> Trace:
         with self._submitting, _all_free(self._slots):
-            return super().intermediates(observation, noise, num_steps)
+            return super().intermediates(*arguments, **options)
 
     def _captured(self, key: CallKey) -> tuple[Graph, Graph]:
         """Both graphs of a key whose buffers are ours; nothing else is in flight while one is captured."""
