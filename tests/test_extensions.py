@@ -77,7 +77,9 @@ def test_the_documented_backend_is_listed_and_runs(documented: Path) -> None:
     assert policy.metadata["backend"] == "noted" and policy.metadata["backend_details"]["calls"] == 1
     assert policy.metadata["real_time"]["modes"] == [] and not policy.runs_batches and not policy.pipelined
     with pytest.raises(ObservationError, match="backend 'noted' has no times, held actions or guidance by token"):
-        policy.infer(observation, conditioning=Conditioning(held=np.arange(10) < 1, values=np.zeros((10, 32))))
+        policy.infer(
+            observation, conditioning=Conditioning(held=np.arange(10) < 1, values=np.zeros((10, 32), np.float32))
+        )
     with pytest.raises(ConfigError, match="backend 'noted' runs one observation at a time"):
         policy.submit(observation)
     with pytest.raises(BackendError, match="backend 'noted' has no halves of a call"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from conftest import golden_cases, golden_model
 from torch import Tensor
 
+import turbopi
 from turbopi.config import GemmaConfig, Kind, ModelConfig
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.denoise import time_embedding, time_grid
@@ -18,6 +20,14 @@ from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, parameter_dty
 from turbopi.support.errors import ConfigError, ObservationError
 
 STEPS = 3
+
+
+def test_nothing_outside_the_models_tests_for_a_family_by_name() -> None:
+    package = Path(turbopi.__file__).parent
+    by_name = re.compile(r"""(==|!=|\bin)\s*[(\[{]?\s*["']pi0(5)?["']""")
+    files = [file for file in package.rglob("*.py") if package / "models" not in file.parents]
+    assert not [str(file) for file in files if by_name.search(file.read_text(encoding="utf-8"))]
+    assert by_name.search('if config.kind == "pi0":') and by_name.search('kind in ("pi05", "pi0")')
 
 
 def random_observation(seed: int, *, cameras: int = 3, prompt: int = 20, slots: int = 40) -> Observation:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct, field
 
 from turbopi.config import GemmaConfig, ModelConfig
+from turbopi.models import family_of
 
 _Count = Annotated[int, Meta(ge=1)]
 Join = Literal["none", "held", "identity", "jacobian"]
@@ -76,7 +77,7 @@ def stage_work(config: ModelConfig, job: Job, bytes_per_value: int) -> dict[str,
     """
     image_tokens = job.cameras * config.vision.num_tokens
     prefix = image_tokens + job.prompt_tokens
-    suffix = job.horizon + (config.kind == "pi0")
+    suffix = job.horizon + family_of(config).state_token
     return {
         "vision": _vision(config, image_tokens, job.batch, bytes_per_value),
         "prefix": _prefix(config, prefix, job.batch, bytes_per_value),

@@ -11,6 +11,7 @@ from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read
 from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import WeightSource, listing
 from turbopi.config import GemmaConfig, PolicyConfig
+from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import read_json, shown
 
@@ -37,7 +38,7 @@ def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfi
             "action_horizon": policy.model.action_horizon,
             "max_token_len": policy.model.max_prompt_tokens,
             "discrete_state_input": policy.discrete_state_input,
-            "pi05": policy.model.kind == "pi05",
+            "pi05": family_of(policy.model).modulated,
             "paligemma_variant": policy.model.vlm,
             "action_expert_variant": policy.model.expert,
         }

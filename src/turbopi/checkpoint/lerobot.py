@@ -30,6 +30,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
+from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, file_inside, one_line, read_json, shown
 
@@ -98,10 +99,10 @@ class LeRobotFolder:
             robot="lerobot",
             normalization=self.normalization,
             robot_options=self._robot_options(),
-            discrete_state_input=self.kind == "pi05",
+            discrete_state_input=FAMILIES[self.kind].state_in_prompt,
             image_resize="lerobot_0.4" if old else "lerobot",
             prompt_state_dim=self.pipelines.prompt_width or None if old else None,
-            prompt_as_is=self.kind == "pi0",
+            prompt_as_is=not FAMILIES[self.kind].state_in_prompt,
             num_denoising_steps=self.config.integer(
                 "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
             ),
@@ -138,7 +139,7 @@ class LeRobotFolder:
                 f"observations have {self.state_dim}, as LeRobot runs it"
             )
         tokens = self.config.integer(
-            "tokenizer_max_length", 1, LIMITS["max_prompt_tokens"], default=200 if self.kind == "pi05" else 48
+            "tokenizer_max_length", 1, LIMITS["max_prompt_tokens"], default=FAMILIES[self.kind].prompt_tokens
         )
         if tokens != self.pipelines.max_tokens:
             notes.append(
@@ -157,10 +158,10 @@ class LeRobotFolder:
 
     def _check_config(self) -> Kind:
         kind = self.config.values.get("type")
-        if kind not in ("pi05", "pi0"):
+        if not isinstance(kind, str) or kind not in FAMILIES:
             raise CheckpointError(
-                f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's 'pi05' and "
-                "'pi0' (and openpi's own checkpoints of Pi0 and Pi0.5)"
+                f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's "
+                f"{' and '.join(map(repr, FAMILIES))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
             )
         if "resize_imgs_with_padding" in self.config.values:
             raise CheckpointError(
@@ -170,10 +171,11 @@ class LeRobotFolder:
         state, action = (
             self.config.integer(f"max_{name}_dim", 1, LIMITS["action_dim"], 32) for name in ("state", "action")
         )
-        if kind == "pi0" and state != action:
+        family = FAMILIES[cast(Kind, kind)]
+        if family.state_token and state != action:
             raise CheckpointError(
-                f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's Pi0 has one width "
-                "for both"
+                f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's {family.label} has "
+                "one width for both"
             )
         for key, choices in _CHOICES.items():
             if self.config.values.get(key) is not None:
@@ -184,7 +186,7 @@ class LeRobotFolder:
                 f"{self.file} has {key} = {shown(self.config.values[key])}, which Turbo-Pi doesn't compute; it does "
                 f"{meaning}. Run this checkpoint with LeRobot's own policy"
             )
-        return cast(Kind, kind)
+        return family.kind
 
     @property
     def _chunk_size(self) -> int:

@@ -36,6 +36,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from turbopi.config import LIMITS, Kind
+from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError
 from turbopi.support.reading import Fields, file_inside, read_json, shown
 
@@ -69,7 +70,6 @@ _STEPS: dict[str, dict[str, tuple[str, ...]]] = {
     POSTPROCESSOR: {UNNORMALIZER: _SCALING, ABSOLUTE: ("enabled",), **_HARMLESS},
 }
 _OFTEN = {*_HARMLESS, *_NEW_LINES}
-_NEEDED: dict[Kind, tuple[str, ...]] = {"pi05": (STATE_STEP, TOKENIZER), "pi0": (NEW_LINE, TOKENIZER)}
 _ORDER = (RENAME, RELATIVE, NORMALIZER, *_NEW_LINES, STATE_STEP, TOKENIZER, UNNORMALIZER, ABSOLUTE)
 _PROMPT = (*_NEW_LINES, STATE_STEP, TOKENIZER)
 _BEFORE = {(first, then) for i, first in enumerate(_ORDER) for then in _ORDER[i + 1 :] if then not in _NEW_LINES}
@@ -109,7 +109,7 @@ class Pipelines:
         self.max_tokens = self._tokenizer()
         self.tokenizer = self._named_tokenizer(folder)
         self.prompt_width = 0
-        if kind == "pi05":
+        if FAMILIES[kind].state_in_prompt:
             state_step = self.steps[STATE_STEP]
             self.prompt_width = state_step.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
             if not state_step.config.flag("include_state_in_prompt", True):
@@ -221,20 +221,23 @@ def _read(file: Path, kind: Kind) -> list[Step]:
         if late is not None:
             order = ", ".join(step for step in _ORDER if step in _known(file, kind) and step not in _NEW_LINES)
             raise CheckpointError(f"{file} has {late} before {name}, which computes something else than {order}")
-    for name in _NEEDED[kind] if file.name == PREPROCESSOR else ():
+    needed = (STATE_STEP if FAMILIES[kind].state_in_prompt else NEW_LINE, TOKENIZER)
+    for name in needed if file.name == PREPROCESSOR else ():
         if name not in names and not (name == NEW_LINE and set(names) & set(_NEW_LINES)):
             raise CheckpointError(f"{file} has no step {name}, which every policy of type {kind} is trained with")
     return [step for step in steps if step.name not in _OFTEN]
 
 
 def _must_precede(first: str, then: str, kind: Kind) -> bool:
-    """Whether another order would compute something else: nothing in a prompt of Pi0 comes from the state."""
-    apart = kind == "pi0" and (first in _PROMPT) != (then in _PROMPT)
+    """Whether another order would compute something else: of Pi0, nothing in a prompt comes from the state."""
+    apart = not FAMILIES[kind].state_in_prompt and (first in _PROMPT) != (then in _PROMPT)
     return (first, then) in _BEFORE and not apart
 
 
 def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
-    return {name: keys for name, keys in _STEPS[file.name].items() if name != STATE_STEP or kind == "pi05"}
+    return {
+        name: keys for name, keys in _STEPS[file.name].items() if name != STATE_STEP or FAMILIES[kind].state_in_prompt
+    }
 
 
 def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:

@@ -46,6 +46,7 @@ from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
 from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
+from turbopi.models import family_of
 from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import is_finite, is_integer, read_json, shown
@@ -153,8 +154,10 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     config = replace(config, **{key: values[key] for key in _OF_POLICY if key in values})
     config = config.with_model(**{key: values[key] for key in _OF_MODEL if key in values})
     check_real_time(config, settings.source)
-    if config.model.kind == "pi0" and config.discrete_state_input:
-        raise ConfigError(f"{settings.source}: discrete_state_input is true, but Pi0 reads its state as a number token")
+    if config.discrete_state_input and (family := family_of(config.model)).state_token:
+        raise ConfigError(
+            f"{settings.source}: discrete_state_input is true, but {family.label} reads its state as a number token"
+        )
     return config
 
 

@@ -6,6 +6,7 @@ from math import isqrt
 
 from turbopi.checkpoint.source import Shape, WeightSource, listing
 from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, VisionConfig
+from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import shown
 
@@ -33,23 +34,26 @@ _PROBES = (
 
 
 def detect_kind(source: WeightSource, where: object) -> Kind:
-    """Pi0.5 has a time MLP and adaRMS norms, Pi0 a state projection. CheckpointError if it is neither, or both."""
+    """The family whose marks the weights have. CheckpointError if it is none, or several."""
     names = source.shapes
-    pi05 = [name for name in names if name.startswith(("time_mlp_", "expert.norm.dense."))]
-    pi0 = [name for name in names if name.startswith(("state_proj.", "action_time_mlp_"))]
+    marked = {kind: [name for name in names if name.startswith(one.marks)] for kind, one in FAMILIES.items()}
+    fitting = [kind for kind, ours in marked.items() if ours]
     has_actions = any(name.startswith(("action_in_proj.", "expert.")) for name in names)
     if not has_actions and any(name.startswith("vlm.") for name in names):
         raise CheckpointError(
             f"{where} has a language model but no action expert: this looks like Pi0-FAST, which decodes action tokens "
             "one by one. Turbo-Pi runs the flow-matching Pi0 and Pi0.5; serve this checkpoint with openpi"
         )
-    if bool(pi05) == bool(pi0):
-        found = f"tensors of both ({pi05[0]}, {pi0[0]})" if pi05 else "neither time_mlp_in (Pi0.5) nor state_proj (Pi0)"
-        if not pi05:
+    if len(fitting) != 1:
+        found = f"tensors of both ({', '.join(marked[kind][0] for kind in fitting)})"
+        if not fitting:
+            found = f"neither {' nor '.join(f'{one.marks[0]} ({one.label})' for one in FAMILIES.values())}"
             first = {name.split(".")[0].split("/")[0]: source.native_name(name) for name in sorted(names, reverse=True)}
             found += f". Of its {len(names)} tensors the first of each module: {listing(sorted(first.values()))}"
-        raise CheckpointError(f"{where} is neither Pi0.5 nor Pi0: it has {found}")
-    return "pi05" if pi05 else "pi0"
+        raise CheckpointError(
+            f"{where} is neither {' nor '.join(one.label for one in FAMILIES.values())}: it has {found}"
+        )
+    return fitting[0]
 
 
 def model_sizes(

@@ -14,6 +14,7 @@ from rich.table import Table
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
+from turbopi.models import FAMILIES
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
 from turbopi.support.text import data_size, denoising
@@ -194,7 +195,7 @@ def _statistics_source(info: dict[str, Any]) -> str:
 
 
 def _state_input(info: dict[str, Any]) -> str:
-    if info["kind"] == "pi0":
+    if FAMILIES[info["kind"]].state_token:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
 

@@ -20,6 +20,7 @@ from turbopi.engine.forward import Rope, norm_weights, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import BackwardOps, KeepingDenoiser, KeptStep, Ops, State
+from turbopi.models import family_of
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,8 @@ class Expert:
 
     def _heads(self, tokens: Tensor) -> tuple[Tensor, int, int, bool]:
         """What attention is told of what its queries see: length, slots, heads, whether there is a state token."""
-        state_token = self.config.kind == "pi0" and self.hidden is None  # else `hidden` says what it doesn't see
+        # beside `hidden` there is none: that says what the state's token doesn't see
+        state_token = family_of(self.config).state_token and self.hidden is None
         return self.length, self._slots(tokens), self.config.expert.num_heads, state_token
 
 
@@ -164,7 +166,7 @@ def jacobian_step(
 def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_tokens: Tensor) -> Tensor:
     """Back from the actions' tokens float32[..., H, D] to x_t [..., H, A]. `time` float32[D] or [..., H, D]: Pi0's."""
     d = d_tokens.float()
-    if config.kind == "pi0":
+    if not family_of(config).modulated:
         actions = F.linear(x_t, small["action_in_proj.weight"], small["action_in_proj.bias"])
         mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
         inner = F.linear(mixed, small["action_time_mlp_in.weight"], small["action_time_mlp_in.bias"])

@@ -28,6 +28,7 @@ from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
 from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
+from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.denoise import euler_step, step_size
 
@@ -179,7 +180,7 @@ class BatchLoop:
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
-        self._tokens = loop.horizon + (config.kind == "pi0")
+        self._tokens = loop.horizon + family_of(config).state_token
         self._asked = None if loop.form == "plain" else Conditioned.allocate(config, loop, device, batch)
         self._times = StepTimes.of(config, loop, table, self._asked, device)
         chunk = (batch, loop.horizon, config.action_dim)
@@ -234,7 +235,7 @@ class BatchLoop:
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
         self.x_t[0] = self._noise
-        if self._asked is None and self._buffers.config.kind == "pi05":
+        if self._asked is None and family_of(self._buffers.config).modulated:
             self._run_plain_steps(weights, rope)
             return
         whole = self._whole_cache() if self._loop.form == "jacobian" else None
@@ -271,12 +272,11 @@ class BatchLoop:
         """Suffix tokens [B * T, D] of a step through all layers of the expert."""
         buffers, config = self._buffers, self._buffers.config
         batched, heads = buffers.ops.batch or PLAIN_BATCH, config.expert.num_heads
+        state_token = family_of(config).state_token
 
         def attend(i: int, qkv: Tensor, **input: Any) -> Tensor:
             prefix = buffers.cache.k[i], buffers.cache.v[i]
-            return batched.suffix_attention(
-                qkv, *rope, *prefix, *buffers.segments, heads, config.kind == "pi0", **input
-            )
+            return batched.suffix_attention(qkv, *rope, *prefix, *buffers.segments, heads, state_token, **input)
 
         ops = batched.expert(buffers.ops)
         return forward.expert_layers(config, weights.expert, ops, tokens, self._times.modulation(step), attend)
@@ -309,8 +309,8 @@ class BatchLoop:
             F.pad(one.masked_fill(unwritten, 0), (0, 0, 0, end - buffers.rows))
             for one in (buffers.cache.k, buffers.cache.v)
         )
-        pi0 = buffers.config.kind == "pi0"
-        return k, v, ~visible_to_suffix(starts, lengths, end - count, count, pi0)[:, None]
+        state_token = family_of(buffers.config).state_token
+        return k, v, ~visible_to_suffix(starts, lengths, end - count, count, state_token)[:, None]
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._times.modulation(step)

@@ -25,6 +25,7 @@ from turbopi.engine.graph_cache import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
+from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.denoise import euler_step
 from turbopi.preprocess.images import fitted
@@ -60,7 +61,7 @@ class CallShape:
         return self.cameras * config.vision.num_tokens + self.prompt_slots
 
     def suffix_tokens(self, config: ModelConfig) -> int:
-        return self.horizon + (config.kind == "pi0")
+        return self.horizon + family_of(config).state_token
 
     def cache_rows(self, config: ModelConfig) -> int:
         """Keys of the suffix's attention: the prefix's slots, rows that nothing sees, the suffix's.

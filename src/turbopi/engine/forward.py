@@ -24,6 +24,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, Ops, State, VisionLayer
+from turbopi.models import family_of
 from turbopi.models.pi0.layers import rope_tables
 from turbopi.quantization.fp8 import input_of
 
@@ -187,10 +188,11 @@ def expert_output(
     float32[2 * layers + 1, 3, D] is one step of the modulation (Pi0.5) or None (Pi0).
     """
     slots, heads = cache_k.shape[1] - tokens.shape[0], config.expert.num_heads
+    state_token = family_of(config).state_token
 
     def attend(i: int, qkv: Tensor, **input: Any) -> Tensor:
         q = ops.rope_split(qkv, *rope, cache_k[i, slots:], cache_v[i, slots:])
-        return ops.attention(q, cache_k[i], cache_v[i], length, slots, heads, config.kind == "pi0", **input)
+        return ops.attention(q, cache_k[i], cache_v[i], length, slots, heads, state_token, **input)
 
     stream = expert_layers(config, weights.expert, ops, tokens, table, attend)
     return final_norm(config, weights, ops, table, *stream)
@@ -249,10 +251,12 @@ def suffix_tokens(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, 
     time float32[D], or [H, D] by token, and state [..., A] are Pi0's: Pi0.5 has the time in its norms.
     """
     actions = project(small, "action_in_proj", x_t)
-    if config.kind == "pi05":
+    family = family_of(config)
+    if not family.modulated:
+        mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
+        actions = project(small, "action_time_mlp_out", F.silu(project(small, "action_time_mlp_in", mixed)))
+    if not family.state_token:
         return actions
-    mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
-    actions = project(small, "action_time_mlp_out", F.silu(project(small, "action_time_mlp_in", mixed)))
     return torch.cat((project(small, "state_proj", state[..., None, :]), actions), dim=-2)
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
+from turbopi.models import family_of
 from turbopi.models.pi0.reference import parameter_shapes
 
 HOST = torch.device("cpu")
@@ -21,7 +22,7 @@ _PART = re.compile(rf"(.*\.)({'|'.join((*QKV, *GATE_UP))})(\.weight|\.bias)")
 
 def is_conditioning(config: ModelConfig, name: str) -> bool:
     """Whether a tensor is of the time MLP or adaRMS, whose results are computed on the host, once."""
-    return ".dense." in name or (config.kind == "pi05" and name.startswith("time_mlp_"))
+    return ".dense." in name or (family_of(config).modulated and name.startswith("time_mlp_"))
 
 
 class PackingRoom:

@@ -17,6 +17,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
 from turbopi.engine.weight_placement import GATE_UP, QKV, is_conditioning, join
 from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
+from turbopi.models import family_of
 from turbopi.models.pi0.denoise import time_embedding, time_grid
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix, whole_lines
 
@@ -175,7 +176,7 @@ def modulation_at(config: ModelConfig, conditioning: State, times: np.ndarray) -
     It depends on nothing but the time. Norms in order of use: two a layer, then the final one; each has
     1 + scale, shift and gate. None for Pi0, which has no adaRMS.
     """
-    if config.kind == "pi0":
+    if not family_of(config).modulated:
         return None
 
     def linear(name: str, x: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
+from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs
 from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
@@ -277,7 +278,7 @@ class Pipeline:
 
     def _normalize_state(self, sample: Incoming) -> None:
         state, limit = read_state(sample.robot.state, "state", self.robot.state_dim), self.config.model.action_dim
-        if len(state) > limit and self.config.model.kind == "pi0":  # Pi0.5 has it in the prompt or nowhere
+        if len(state) > limit and family_of(self.config.model).state_token:
             raise ObservationError(f"the state has {len(state)} values, but the model takes at most {limit}")
         sample.state = self.state_scale.normalize(state)
 
@@ -370,7 +371,7 @@ class Pipeline:
     def _check(self) -> None:
         """Refuse now what would otherwise fail, or go wrong in silence, at the first observation."""
         config, robot, limit = self.config, self.robot, self.config.model.action_dim
-        if config.discrete_state_input and config.model.kind != "pi05":
+        if config.discrete_state_input and family_of(config.model).state_token:
             raise ConfigError(f"{config.name}: only Pi0.5 reads the state from the prompt; Pi0 needs it set to false")
         if config.image_resize not in RESIZES:
             raise ConfigError(
@@ -383,7 +384,7 @@ class Pipeline:
                 f"have {limit}"
             )
         for name, width, scale in dims:
-            limited = name == "actions" or config.model.kind == "pi0"  # no weight of Pi0.5 depends on the state's width
+            limited = name == "actions" or family_of(config.model).state_token  # no other weight depends on the width
             if width is not None and limited and width > limit:
                 raise ConfigError(f"robot {robot.name} has {width} values of {name}, but the model takes {limit}")
             if scale.width is None:

@@ -18,6 +18,7 @@ from turbopi.kernels.ops import ops_of
 from turbopi.kernels.plain_batch import PLAIN_BATCH
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import Kernels, Knobs, TileTable
+from turbopi.models import family_of
 from turbopi.quantization.fp8 import Matrix
 from turbopi.tune.gpu import GpuBench, prefixes_in_a_row, random
 from turbopi.tune.race import Round
@@ -52,7 +53,7 @@ class ExpertLayers:
         self._generator = torch.Generator(device).manual_seed(1)
         rows, prefix = of.batch * of.tokens, of.batch * of.prefix_rows
         heads = g.num_heads * g.head_dim
-        norm = None if config.kind == "pi05" else torch.ones(g.width, device=device)
+        norm = None if family_of(config).modulated else torch.ones(g.width, device=device)
         self._layers = [
             GemmaLayer(
                 self._matrix(heads + 2 * g.head_dim, g.width),
@@ -66,7 +67,7 @@ class ExpertLayers:
         ]
         modulation = GATE * self._random(2 * g.depth + 1, 3, g.width).float()
         modulation[:, 0] += 1  # the norms' scales
-        self._table = modulation if config.kind == "pi05" else None
+        self._table = modulation if family_of(config).modulated else None
         self._tokens = self._random(rows, g.width)
         angles = 6 * self._random(rows, g.head_dim // 2).float()
         self._rope = angles.cos(), angles.sin()
@@ -84,7 +85,7 @@ class ExpertLayers:
         def attend(i: int, qkv: Tensor, **input: float) -> Tensor:
             places = self._keys[i], self._values[i], *self._segments
             return batched.suffix_attention(
-                qkv, *self._rope, *places, config.expert.num_heads, config.kind == "pi0", **input
+                qkv, *self._rope, *places, config.expert.num_heads, family_of(config).state_token, **input
             )
 
         return forward.expert_layers(config, self._layers, batched.expert(ops), self._tokens, self._table, attend)[0]

@@ -14,6 +14,7 @@ from turbopi.engine.forward import HEAD_LAYERS, row_chunks
 from turbopi.engine.runner import BUCKET, bucket
 from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
+from turbopi.models import family_of
 from turbopi.quantization.fp8 import whole_lines
 
 Precision = Literal["bf16", "fp8"]
@@ -109,7 +110,7 @@ def operations(
     """Those of one call whose tiles can be chosen. `horizon` and `steps` matter to batches alone."""
     found = [*_vision(config, call, precision, kernels), *_prefix(config, call, precision, kernels)]
     if call.batch > 1:
-        found += _expert(config, call, precision, kernels, steps, horizon + (config.kind == "pi0"))
+        found += _expert(config, call, precision, kernels, steps, horizon + family_of(config).state_token)
     return [one for one in found if _has_choice(one)]
 
 

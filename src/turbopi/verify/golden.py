@@ -19,6 +19,7 @@ import torch
 
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, Normalization, PolicyConfig, VisionConfig
+from turbopi.models import FAMILIES
 from turbopi.models.observation import Observation
 from turbopi.support.errors import CheckpointError, ObservationError
 from turbopi.support.reading import read_json, read_npz
@@ -106,12 +107,12 @@ class GoldenFolder:
         limits = self.sizes["max_token_len"]
         assert isinstance(limits, dict)
         width = inputs["tokenized_prompt"].shape[1]
-        fits: list[Kind] = [kind for kind in ("pi05", "pi0") if limits.get(kind) == width]
+        fits: list[Kind] = [kind for kind in FAMILIES if limits.get(kind) == width]
         if len(fits) == 1:
             return fits[0]
         if any("cond" in arrays for run in runs for arrays in run.variants.values()):
-            return "pi05"
-        kinds: list[Kind] = [kind for kind in ("pi05", "pi0") if (self.path / "checkpoints" / kind).exists()]
+            return next(kind for kind, family in FAMILIES.items() if family.modulated)
+        kinds: list[Kind] = [kind for kind in FAMILIES if (self.path / "checkpoints" / kind).exists()]
         if len(kinds) == 1:
             return kinds[0]
         raise ObservationError(

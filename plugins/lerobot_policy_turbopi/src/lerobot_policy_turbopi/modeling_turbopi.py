@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiConfig
 from turbopi import UnifiedPolicy, open_checkpoint
+from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.policy.call_options import checked_steps
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
@@ -167,7 +168,7 @@ class TurboPiPolicy(PreTrainedPolicy):
     def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
         """float32[B, max_action_dim]: Pi0's, padded. Pi0.5 has it in the prompt."""
         state = torch.zeros(rows, self.config.max_action_dim)
-        if self.turbopi.config.model.kind == "pi0":
+        if family_of(self.turbopi.config.model).state_token:
             given = batch[OBS_STATE]
             state[:, : given.shape[-1]] = given
         return state

@@ -16,6 +16,7 @@ from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTi
 from turbopi.backends.onnx.cache import kept_export
 from turbopi.backends.onnx.export import EXPORT_NEEDS, missing_library
 from turbopi.checkpoint.onnx_folder import GRAPHS, Export, GraphsOnly, open_export
+from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings
 from turbopi.models.pi0.denoise import euler_step, time_embedding, time_grid
@@ -172,7 +173,7 @@ class OnnxBackend(Backend):
     def _denoise(self, cache: KVCache, noise: Tensor, num_steps: int, trace: Trace | None = None) -> Tensor:
         times = time_grid(num_steps, self.config.time_grid)
         time_embs = time_embedding(times, self.config.expert.width)
-        has_state = self.config.kind == "pi0"
+        has_state = family_of(self.config).state_token
         fixed = {
             "k": cache.k,
             "v": cache.v,

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from turbopi.config import ModelConfig
+from turbopi.models import family_of
 from turbopi.models.pi0.prefix import embed_prompt, prefix_keys_values
 from turbopi.models.pi0.reference import Pi0Model
 
@@ -81,7 +82,7 @@ class DenoiseStepGraph(nn.Module):
     def __init__(self, model: Pi0Model) -> None:
         super().__init__()
         self.model, self.rope = model, _Rotary(model.config)
-        self.adaptive = model.config.kind == "pi05"
+        self.adaptive = family_of(model.config).modulated
 
     def forward(
         self,
@@ -127,7 +128,7 @@ def graphs(model: Pi0Model) -> list[Graph]:
     side = config.vision.image_size
     cache = torch.zeros(config.vlm.depth, 1, config.vlm.num_kv_heads, some, config.vlm.head_dim)
     positions, mask = torch.arange(some)[None], torch.ones(1, some, dtype=torch.bool)
-    has_state = config.kind == "pi0"
+    has_state = family_of(config).state_token
     suffix: Any = h + 1 if has_state else h
     step = {
         "x_t": torch.zeros(1, horizon, config.action_dim),

@@ -21,6 +21,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.graph import Mark
 from turbopi.engine.weights import Weights
 from turbopi.kernels.plain import embed_patches
+from turbopi.models import family_of
 from turbopi.models.pi0.denoise import euler_step, time_embedding, time_grid
 from turbopi.models.pi0.layers import apply_rope, rope_tables
 from turbopi.support.errors import BackendError
@@ -68,7 +69,7 @@ class EngineCall:
         self.table = table
         device, dtype = weights.embed_tokens.device, weights.embed_tokens.dtype
         size, slots = config.vision.image_size, shape.prefix_slots(config)
-        suffix = shape.horizon + (config.kind == "pi0")
+        suffix = shape.horizon + family_of(config).state_token
         pixels = torch.float32 if float_images else torch.uint8
 
         def pair(dims: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -131,7 +132,7 @@ class EngineCall:
         slots = self.cache_k.shape[1]
         hidden = (self.key_index >= self.length) & (self.key_index < slots)
         mask = torch.where(hidden, HIDDEN, 0.0)[None]
-        if self.config.kind == "pi0":  # the state token doesn't see the actions behind it
+        if family_of(self.config).state_token:  # the state token doesn't see the actions behind it
             heads = self.config.expert.num_heads
             mask = mask.repeat(len(self.suffix_offsets) * heads, 1)
             mask[:heads, slots + 1 :] = HIDDEN
@@ -189,9 +190,11 @@ class EngineCall:
     def _tokens(self, step: int) -> Tensor:
         """The suffix: actions, and for Pi0 the state's token before them and the time mixed in."""
         actions = self._project("action_in_proj", self.x_t[step])
-        if self.config.kind == "pi0":
+        family = family_of(self.config)
+        if not family.modulated:
             mixed = torch.cat((actions, self.time_embs[step].expand_as(actions)), dim=-1)
             actions = self._project("action_time_mlp_out", F.silu(self._project("action_time_mlp_in", mixed)))
+        if family.state_token:
             actions = torch.cat((self._project("state_proj", self.state[None]), actions))
         return actions.to(self.embs.dtype)
 

@@ -23,6 +23,7 @@ from turbopi.backends.tensorrt.ops import Dtype, NetworkOps, Value, to_fp8
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, VisionLayer
+from turbopi.models import family_of
 from turbopi.quantization.fp8 import Matrix
 
 # Added to a hidden key's logit: behind any visible key its exp() is 0. Far from float32's lowest, which openpi takes,
@@ -90,7 +91,7 @@ def denoise_step(ops: NetworkOps, config: ModelConfig, weights: Weights, inputs:
     mask         float32[1 or H * n, R + H]      added to the logits, 0 or HIDDEN; a row is (token, head), token first
     """
     g, dtype = config.expert, matrix_dtype(weights)
-    adaptive = config.kind == "pi05"
+    adaptive = family_of(config).modulated
     suffix, rows = ops.shape(inputs["tokens"])[0], ops.shape(inputs["k"])[1]
     rope = tuple(ops.reshape(inputs[name], (suffix, 1, g.head_dim // 2)) for name in ("cos", "sin"))
 

@@ -11,6 +11,7 @@ from turbopi.backends.tensorrt.networks import Fp8Scales
 from turbopi.backends.tensorrt.ops import Dtype
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
+from turbopi.models import family_of
 
 SLOTS = 16  # prompt lengths that engines are built for are multiples of it
 GetWeights = Callable[[], Weights]  # called only when an engine is built; raises BackendError if they are gone
@@ -72,7 +73,7 @@ def _feed_forward(
 
 def denoise_step(config: ModelConfig, weights: GetWeights, shape: EngineShape, dtype: Dtype) -> Specification:
     """The action expert over the shape's whole cache; see networks.denoise_step."""
-    g, adaptive = config.expert, config.kind == "pi05"
+    g, adaptive = config.expert, family_of(config).modulated
     suffix, rows = shape.horizon + (not adaptive), shape.prefix_slots(config)
     cache, angles = Input((g.depth, rows, g.head_dim), dtype), Input((suffix, g.head_dim // 2), "f32")
     masks = 1 if adaptive else suffix * g.num_heads

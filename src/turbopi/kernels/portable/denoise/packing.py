@@ -13,6 +13,7 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.quantize import quantize
+from turbopi.models import family_of
 from turbopi.quantization import sites
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import E4M3, Directions
@@ -27,7 +28,7 @@ KINDS = sites.KINDS["expert"]  # a layer's matrices, in the order in which they 
 def refusal(config: ModelConfig) -> str | None:
     """Why the kernel can't run this model, or None if it can."""
     g = config.expert
-    if config.kind != "pi05":
+    if not family_of(config).modulated or family_of(config).state_token:
         return f"it covers Pi0.5, this model is {config.kind}"
     if g.num_kv_heads != 1:
         return f"it needs one key/value head, this model has {g.num_kv_heads}"

@@ -16,6 +16,7 @@ from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.denoise.packing import KINDS as KINDS
 from turbopi.kernels.portable.denoise.packing import matrix_shapes
 from turbopi.kernels.portable.quantize import quantize
+from turbopi.models import family_of
 from turbopi.quantization.fp8 import E4M3, Directions
 from turbopi.support.errors import BackendError
 
@@ -29,7 +30,7 @@ Precision = Literal["bf16", "fp8"]
 def refusal(config: ModelConfig) -> str | None:
     """Why the kernel can't run this model, or None if it can."""
     g = config.expert
-    if config.kind != "pi05":
+    if not family_of(config).modulated or family_of(config).state_token:
         return f"it covers Pi0.5, this model is {config.kind}"
     if g.num_kv_heads != 1:
         return f"it needs one key/value head, this model has {g.num_kv_heads}"
