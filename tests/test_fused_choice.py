@@ -13,6 +13,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.graph_cache import Loop
+from turbopi.engine.solving import evaluation_loops
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
@@ -20,6 +21,7 @@ from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing as denoise_packing
 from turbopi.kernels.sm90.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.plain import denoise_plain
+from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import BackendUnavailable, DeviceLost
 
 GPU = torch.device("cuda", 0)
@@ -342,6 +344,20 @@ def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgot
     gpu.backend._forget(Loop(3, 10))
     assert gpu.places == {GPU}, "the loop of 4 steps still takes operations"
     gpu.backend._forget(Loop(4, 10))
+    assert gpu.places == {CPU}
+
+
+def test_the_expert_stays_on_the_device_while_a_solvers_loop_reads_it_by_operations(gpu: OnFakeGpu) -> None:
+    solver = Loop(2, 10, "solver", (1.0, 0.5), Integration("ab2", (1.0, 0.5, 0.0)))
+    evaluation = Loop(1, 10, "tokens", solver.times)  # which may be a loop of its own
+    assert evaluation in evaluation_loops(solver)
+    gpu.backend._recent.use(solver)
+    gpu.kernels.refuse = "too small"
+    assert gpu.backend._make_denoiser(CallShape(3, 16, evaluation), gpu.table) is None
+    gpu.backend._forget_all(evaluation)
+    assert gpu.places == {GPU}
+    gpu.backend._recent._loops.clear()
+    gpu.backend._forget_all(solver)
     assert gpu.places == {CPU}
 
 

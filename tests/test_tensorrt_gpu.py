@@ -71,7 +71,7 @@ def test_actions_in_flight_are_those_of_one_at_a_time_bit_for_bit() -> None:
     noises = [torch.randn(one.noise[:1].shape, generator=torch.Generator().manual_seed(i)) for i in range(12)]
     plain, pipelined = made("tensorrt"), made("tensorrt_pipelined")
     expected = [plain.sample(observation, noise, 10).actions for noise in noises]
-    futures = [pipelined.submit(observation, noise, 10) for noise in noises]  # type: ignore[attr-defined]
+    futures = [pipelined.submit(observation, noise, 10) for noise in noises]
     for future, actions in zip(futures, expected, strict=True):
         assert torch.equal(future.result(timeout=60).actions, actions)
 

@@ -184,7 +184,7 @@ def test_a_way_is_what_the_policys_options_of_the_same_names_are() -> None:
 
         def by_option(call: Call, asked: Any = asked) -> Tensor:
             conditioning = Conditioning(integration=asked)
-            return product.backend.sample(call.observation, call.noise, 3, conditioning=conditioning).actions  # type: ignore[call-arg]
+            return product.backend.sample(call.observation, call.noise, 3, conditioning=conditioning).actions
 
         one, other = (play(policy, episodes, actor).paths for actor in (steps.actor(policy, way, {}), by_option))
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)

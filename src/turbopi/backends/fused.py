@@ -24,6 +24,7 @@ from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.engine.call import CallShape
 from turbopi.engine.graph_cache import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
+from turbopi.engine.solving import evaluation_loops
 from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops, PairDenoiser
@@ -269,10 +270,10 @@ class FusedBackend(CudaGraphBackend):
         layers = self._expert.use("fp8" if in_fp8 else "layers", User("batch", loop, rows))
         return replace(self._weights, expert=layers)
 
-    def _in_fp8(self, layers: Layers) -> list[GemmaLayer[Matrix]]:
+    def _in_fp8(self, layers: Layers) -> list[GemmaLayer[Any]]:
         """The expert's layers on the device, as operations multiply in FP8."""
 
-        def quantized(number: int, layer: GemmaLayer[Tensor]) -> GemmaLayer[Matrix]:
+        def quantized(number: int, layer: GemmaLayer[Any]) -> GemmaLayer[Any]:
             made: Any = {
                 kind: self._quantized(f"expert.{number}.{kind}", getattr(layer, kind)) for kind in KINDS["expert"]
             }
@@ -287,6 +288,8 @@ class FusedBackend(CudaGraphBackend):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
+        if any(loop in evaluation_loops(other) for other in self._recent):  # a solver's graph goes on reading them
+            return
         for user in [user for user in self._kernels if user.loop == loop]:
             del self._kernels[user]
         self._expert.release(lambda user: user.loop == loop)

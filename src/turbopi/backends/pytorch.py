@@ -8,7 +8,7 @@ from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTi
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0.reference import Pi0Model, Trace
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, Trace
 from turbopi.support.errors import BackendError
 
 
@@ -22,7 +22,7 @@ class PyTorchBackend(Backend):
     _warm = False
 
     def load_weights(self, load: LoadState) -> None:
-        precision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
+        precision: FloatPrecision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
         self.model = self.model_class.from_state(self.config, load(self.device, precision))
 
     def warmup(self, *arguments: Any, **options: Any) -> None:

@@ -8,7 +8,6 @@ the processors' steps may be in lerobot_pipeline.py.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -171,7 +170,7 @@ class LeRobotFolder:
         state, action = (
             self.config.integer(f"max_{name}_dim", 1, LIMITS["action_dim"], 32) for name in ("state", "action")
         )
-        family = FAMILIES[cast(Kind, kind)]
+        family = FAMILIES[kind]
         if family.state_token and state != action:
             raise CheckpointError(
                 f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's {family.label} has "
