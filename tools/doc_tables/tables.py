@@ -307,11 +307,16 @@ def _read_delays(file: Path) -> Any:
     return load_delays(file)
 
 
+DELAY_HEADS = ("execution", "delay", "success [95 %]", "against the first way", "seam jump")  # of those in delays.html
+
+
 def delays(document: Any) -> list[str]:
     """A policy under delay: `turbopi eval … --delay-steps`."""
     from turbopi.evaluate.delays import HEADS, row
 
-    return _table(HEADS, [row(cell) for cell in document.cells])
+    columns = [HEADS.index(head) for head in DELAY_HEADS]
+    rows = [row(cell) for cell in document.cells]
+    return _table(DELAY_HEADS, [[cells[column] for column in columns] for cells in rows])
 
 
 def _read_judged(file: Path) -> Any:
