@@ -105,9 +105,9 @@ def main_job(document: BenchDocument) -> list[str]:
 
 
 def whole_calls(document: BenchDocument) -> list[str]:
-    """`fused`: medians of the whole call for every shape and number of steps."""
+    """`fused`: medians of the whole call for every shape, with some numbers of steps."""
     jobs = [result.job for result in document.results if result.backend == "fused"]
-    steps = sorted({job.steps for job in jobs})
+    steps = sorted({job.steps for job in jobs} & {1, 3, 10})
     lines: list[str] = []
     for precision in ("bf16", "fp8"):
         rows = []
@@ -128,20 +128,17 @@ def whole_calls(document: BenchDocument) -> list[str]:
 
 
 def joins(document: BenchDocument) -> list[str]:
-    """`fused`: calls whose chunk joins a running one (`turbopi bench --join`) beside plain calls."""
+    """`fused`: calls of conditioned chunks (`turbopi bench --join`), and in brackets how many times a plain call."""
+    kinds = list(dict.fromkeys((one.precision, one.job.horizon) for one in document.results))
     rows = []
-    for one in document.results:
-        job = one.job
-        plain = next(
-            other.milliseconds["total"].p50
-            for other in document.results
-            if (other.backend, other.precision) == (one.backend, one.precision)
-            and other.job == replace(job, join="none")
-        )
-        times = f"{one.milliseconds['total'].p50 / plain:.3f}"
-        rows.append([f"{one.precision}, H = {job.horizon}", JOINS[job.join] or "plain", _ms(one), times])
-        rows[-1] += [_ms(one, "denoise"), _error(one)]
-    return _table(["", "a chunk is", "whole call, ms", "× plain", "denoise", "error"], rows, numbers_from=2)
+    for join, name in JOINS.items():
+        row = [name or "plain"]
+        for precision, horizon in kinds:
+            calls = [_result(document, "fused", precision, horizon=horizon, join=one) for one in (join, "none")]
+            ms, plain = (call.milliseconds["total"].p50 for call in calls if call is not None)
+            row.append(f"{ms:.2f} ({ms / plain:.2f})")
+        rows.append(row)
+    return _table(["a chunk is", *(f"{precision}, H = {horizon}" for precision, horizon in kinds)], rows)
 
 
 def batches(document: BenchDocument) -> list[str]:
@@ -307,16 +304,18 @@ def _read_delays(file: Path) -> Any:
     return load_delays(file)
 
 
-DELAY_HEADS = ("execution", "delay", "success [95 %]", "against the first way", "seam jump")  # of those in delays.html
-
-
 def delays(document: Any) -> list[str]:
-    """A policy under delay: `turbopi eval … --delay-steps`."""
+    """A policy under delay, `turbopi eval … --delay-steps`: success by delay, and jumps at the seams with the longest."""
     from turbopi.evaluate.delays import HEADS, row
 
-    columns = [HEADS.index(head) for head in DELAY_HEADS]
-    rows = [row(cell) for cell in document.cells]
-    return _table(DELAY_HEADS, [[cells[column] for column in columns] for cells in rows])
+    cells = [dict(zip(HEADS, row(cell), strict=True)) for cell in document.cells]
+    waits = sorted({cell["delay"] for cell in cells}, key=int)
+    rows = []
+    for execution in dict.fromkeys(cell["execution"] for cell in cells):
+        own = {cell["delay"]: cell for cell in cells if cell["execution"] == execution}
+        rows.append([execution, *(own[wait]["success [95 %]"] for wait in waits), own[waits[-1]]["seam jump"]])
+    head = ["execution", *(f"delay {wait}: success [95 %]" for wait in waits), f"delay {waits[-1]}: seam jump"]
+    return _table(head, rows)
 
 
 def _read_judged(file: Path) -> Any:
