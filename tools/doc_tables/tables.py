@@ -305,7 +305,7 @@ def _read_delays(file: Path) -> Any:
 
 
 def delays(document: Any) -> list[str]:
-    """A policy under delay, `turbopi eval … --delay-steps`: success by delay, and jumps at the seams with the longest."""
+    """A policy under delay (`turbopi eval … --delay-steps`): success by delay, and seam jumps with the longest."""
     from turbopi.evaluate.delays import HEADS, row
 
     cells = [dict(zip(HEADS, row(cell), strict=True)) for cell in document.cells]
