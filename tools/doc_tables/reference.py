@@ -92,13 +92,13 @@ def _class_section(node: ast.ClassDef, lines: list[str], heading: str) -> str:
     parts = [f"{heading} {node.name}"]
     if made is not None:
         parts.append(_signature(made, node.name))
-    text = _markdown(ast.get_docstring(node) or "")
-    parts.append(text)
-    described = "\n- `" in text  # the docstring has the fields already
+    parts.append(_markdown(ast.get_docstring(node) or ""))
     fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and not ast.unparse(n.target).startswith("_")]
-    if fields and not described:
-        rows = [_field(one, lines) for one in fields]
+    rows = [_field(one, lines) for one in fields]
+    if any(not row.endswith("|  |") for row in rows):
         parts.append("\n".join(["| field | type | unless given | |", "|---|---|---|---|", *rows]))
+    elif rows:
+        parts.append("Fields: " + ", ".join(f"`{ast.unparse(one)}`" for one in fields) + ".")
     for method in methods:
         text = ast.get_docstring(method)
         if method.name.startswith("_") or text is None:

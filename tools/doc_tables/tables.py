@@ -159,21 +159,6 @@ def batches(document: BenchDocument) -> list[str]:
     return _table(head, rows, numbers_from=0)
 
 
-def lines_over_steps(document: BenchDocument) -> list[str]:
-    """What a denoising step adds to a call: two cameras and the main job's prompt."""
-    main = document.main_job
-    rows = [
-        [
-            f"`{line.backend}` {line.precision}, H = {line.horizon}",
-            f"{line.a_ms:.2f}",
-            f"{line.b_ms:.3f}",
-        ]
-        for line in document.linear or ()
-        if (line.cameras, line.prompt_tokens) == (main.cameras, main.prompt_tokens)
-    ]
-    return _table(["ms", "without steps", "for each step"], rows)
-
-
 def errors(document: BenchDocument) -> list[str]:
     """Relative rms of the actions against the float32 reference, by horizon and steps."""
     steps = all_steps(document.results)
@@ -347,7 +332,7 @@ def _read_marks(file: Path) -> list[MarkedVariant]:
 
 
 _OF_BENCHMARKS = (
-    *(headline, main_job, whole_calls, image_sizes, lines_over_steps, joins, batches),
+    *(headline, main_job, whole_calls, image_sizes, joins, batches),
     *(errors, ready, kernels, machine),
 )
 TABLES = {
