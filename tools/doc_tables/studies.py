@@ -43,10 +43,10 @@ def write_reports(root: Path) -> list[Path]:
 
 
 def study(document: Report) -> list[str]:
-    """Whether the result can be believed: how many controls held, and those that failed."""
+    """Whether the result can be believed: how many controls passed, and those that failed."""
     failed = [f"- **Failed:** {one.claim} {one.evidence}".rstrip() for one in document.controls if not one.held]
     count = len(document.controls)
-    return [f"*Controls:* {count - len(failed)} of {count} held.", *(["", *failed] if failed else [])]
+    return [f"*Controls:* {count - len(failed)} of {count} passed.", *(["", *failed] if failed else [])]
 
 
 def few_steps(document: Report) -> list[str]:
