@@ -167,7 +167,7 @@ def errors(document: BenchDocument) -> list[str]:
     for backend, precision, _ in _of_main_job(document):
         for horizon in horizons:
             cells = [_error(_result(document, backend, precision, horizon=horizon, steps=n)) for n in steps]
-            if any(cells):
+            if sum(map(bool, cells)) > 1:  # the main job's own table has the rest
                 rows.append([f"`{backend}` {precision}, H = {horizon}", *cells])
     return _table(["", *(f"{n} step{'s' * (n > 1)}" for n in steps)], rows)
 
