@@ -56,6 +56,19 @@ def test_no_figure_is_said_to_have_no_result_file(document: Path) -> None:
     assert found is None, f"{found[0]!r}: expected a result file below benchmarks/results, or no figure"
 
 
+def test_documents_for_users_stay_short() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(readme.splitlines()) <= 120
+    users = [readme, *(file.read_text(encoding="utf-8") for file in (ROOT / "docs").glob("*.md"))]
+    assert sum(len(text.split()) for text in users) <= 32_000
+
+
+def test_the_glossary_has_each_word_once_in_order() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    words = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")][1:]
+    assert len(words) >= 50 and words == sorted(set(words), key=str.lower)
+
+
 def headings(document: Path) -> set[str]:
     """The anchors that GitHub makes of a document's headings."""
     text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)

@@ -168,10 +168,10 @@ class PolicyConfig:
     asset_id: str | None = None  # folder of norm_stats.json below assets/; None: the only one there
     robot_options: Mapping[str, Any] = field(default_factory=dict)  # passed to a built-in robot
     default_prompt: str | None = None  # for observations without one
-    image_resize: ImageResize = "openpi"  # how pictures become 224 x 224: "openpi", "lerobot" or "lerobot_0.4"
+    image_resize: ImageResize = "openpi"  # how images become 224 x 224: "openpi", "lerobot" or "lerobot_0.4"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
-    num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise; so are the next two
+    num_denoising_steps: int = 10  # the default of a call; so are the next two
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
     real_time: RealTime = RealTime()

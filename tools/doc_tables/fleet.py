@@ -7,7 +7,7 @@ from turbopi.serve.fleet.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, plan_fl
 from turbopi.support.errors import ConfigError
 
 GPUS = (("h200", "fp8"), ("h200", "bf16"), ("h100", "fp8"), ("h100", "bf16"), ("rtx4090", "bf16"))
-ROBOTS = (4, 8, 16, 32, 64)
+ROBOTS = (4, 8, 16, 64)
 CONTROL = ((50.0, 50), (20.0, 10))  # control rate, actions of a chunk
 
 

@@ -23,7 +23,7 @@ Written by `scripts/tables` from the docstrings. `from turbopi import …` gives
 [serving.md](serving.md); your own robot: [robots.md](robots.md).
 
 In shapes: H is the action horizon (actions in a chunk), `action_dim` the model's width of an action, d the robot's, B a
-batch, h and w a picture's height and width.
+batch, h and w an image's height and width.
 """
 _FIRST = ("UnifiedPolicy", "open_checkpoint", "PolicyConfig", "Robot", "RobotInputs")
 _RELATED = (Checkpoint, config.ModelConfig, config.Normalization)
@@ -40,8 +40,8 @@ def reference() -> str:
     parts += [_described(getattr(turbopi, name), "##") for name in (*_FIRST, *rest)]
     parts.append("## Related classes\n")
     parts += [_described(one, "###") for one in _RELATED]
-    parts.append("## Errors\n\n`turbopi.errors` has them, too.\n\n" + _markdown(inspect.getdoc(errors) or "") + "\n")
-    parts += [f"- **`{name}`**: {_line(getattr(turbopi, name).__doc__)}" for name in raised]
+    parts.append("## Errors\n\n`turbopi.errors` has them, too.\n")
+    parts += [f"- **`{name}`**: {_line(getattr(turbopi, name).__doc__)}{_bases(name)}" for name in raised]
     return "\n".join(part.rstrip("\n") + "\n" if not part.startswith("- ") else part for part in parts) + "\n"
 
 
@@ -63,6 +63,12 @@ def stale_reference(root: Path) -> list[str]:
 def _class(name: str) -> type:
     found = getattr(turbopi, name)
     return found if isinstance(found, type) else object
+
+
+def _bases(name: str) -> str:
+    """The classes by which an error can be caught, too."""
+    bases = [one.__name__ for one in _class(name).__bases__ if one not in (errors.TurboPiError, Exception)]
+    return f" Also: {', '.join(bases)}." if bases else ""
 
 
 def _line(docstring: str | None) -> str:
@@ -88,9 +94,11 @@ def _class_section(node: ast.ClassDef, lines: list[str], heading: str) -> str:
         parts.append(_signature(made, node.name))
     parts.append(_markdown(ast.get_docstring(node) or ""))
     fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and not ast.unparse(n.target).startswith("_")]
-    if fields:
-        rows = [_field(one, lines) for one in fields]
+    rows = [_field(one, lines) for one in fields]
+    if any(not row.endswith("|  |") for row in rows):
         parts.append("\n".join(["| field | type | unless given | |", "|---|---|---|---|", *rows]))
+    elif rows:
+        parts.append("Fields: " + ", ".join(f"`{ast.unparse(one)}`" for one in fields) + ".")
     for method in methods:
         text = ast.get_docstring(method)
         if method.name.startswith("_") or text is None:

@@ -105,9 +105,9 @@ def main_job(document: BenchDocument) -> list[str]:
 
 
 def whole_calls(document: BenchDocument) -> list[str]:
-    """`fused`: medians of the whole call for every shape and number of steps."""
+    """`fused`: medians of the whole call for every shape, with some numbers of steps."""
     jobs = [result.job for result in document.results if result.backend == "fused"]
-    steps = sorted({job.steps for job in jobs})
+    steps = sorted({job.steps for job in jobs} & {1, 3, 10})
     lines: list[str] = []
     for precision in ("bf16", "fp8"):
         rows = []
@@ -128,20 +128,17 @@ def whole_calls(document: BenchDocument) -> list[str]:
 
 
 def joins(document: BenchDocument) -> list[str]:
-    """`fused`: calls whose chunk joins a running one (`turbopi bench --join`) beside plain calls."""
+    """`fused`: calls of conditioned chunks (`turbopi bench --join`), and in brackets how many times a plain call."""
+    kinds = list(dict.fromkeys((one.precision, one.job.horizon) for one in document.results))
     rows = []
-    for one in document.results:
-        job = one.job
-        plain = next(
-            other.milliseconds["total"].p50
-            for other in document.results
-            if (other.backend, other.precision) == (one.backend, one.precision)
-            and other.job == replace(job, join="none")
-        )
-        times = f"{one.milliseconds['total'].p50 / plain:.3f}"
-        rows.append([f"{one.precision}, H = {job.horizon}", JOINS[job.join] or "plain", _ms(one), times])
-        rows[-1] += [_ms(one, "denoise"), _error(one)]
-    return _table(["", "a chunk is", "whole call, ms", "× plain", "denoise", "error"], rows, numbers_from=2)
+    for join, name in JOINS.items():
+        row = [name or "plain"]
+        for precision, horizon in kinds:
+            calls = [_result(document, "fused", precision, horizon=horizon, join=one) for one in (join, "none")]
+            ms, plain = (call.milliseconds["total"].p50 for call in calls if call is not None)
+            row.append(f"{ms:.2f} ({ms / plain:.2f})")
+        rows.append(row)
+    return _table(["a chunk is", *(f"{precision}, H = {horizon}" for precision, horizon in kinds)], rows)
 
 
 def batches(document: BenchDocument) -> list[str]:
@@ -162,21 +159,6 @@ def batches(document: BenchDocument) -> list[str]:
     return _table(head, rows, numbers_from=0)
 
 
-def lines_over_steps(document: BenchDocument) -> list[str]:
-    """What a denoising step adds to a call: two cameras and the main job's prompt."""
-    main = document.main_job
-    rows = [
-        [
-            f"`{line.backend}` {line.precision}, H = {line.horizon}",
-            f"{line.a_ms:.2f}",
-            f"{line.b_ms:.3f}",
-        ]
-        for line in document.linear or ()
-        if (line.cameras, line.prompt_tokens) == (main.cameras, main.prompt_tokens)
-    ]
-    return _table(["ms", "without steps", "for each step"], rows)
-
-
 def errors(document: BenchDocument) -> list[str]:
     """Relative rms of the actions against the float32 reference, by horizon and steps."""
     steps = all_steps(document.results)
@@ -185,7 +167,7 @@ def errors(document: BenchDocument) -> list[str]:
     for backend, precision, _ in _of_main_job(document):
         for horizon in horizons:
             cells = [_error(_result(document, backend, precision, horizon=horizon, steps=n)) for n in steps]
-            if any(cells):
+            if sum(map(bool, cells)) > 1:  # the main job's own table has the rest
                 rows.append([f"`{backend}` {precision}, H = {horizon}", *cells])
     return _table(["", *(f"{n} step{'s' * (n > 1)}" for n in steps)], rows)
 
@@ -308,10 +290,17 @@ def _read_delays(file: Path) -> Any:
 
 
 def delays(document: Any) -> list[str]:
-    """A policy under delay: `turbopi eval … --delay-steps`."""
+    """A policy under delay (`turbopi eval … --delay-steps`): success by delay, and seam jumps with the longest."""
     from turbopi.evaluate.delays import HEADS, row
 
-    return _table(HEADS, [row(cell) for cell in document.cells])
+    cells = [dict(zip(HEADS, row(cell), strict=True)) for cell in document.cells]
+    waits = sorted({cell["delay"] for cell in cells}, key=int)
+    rows = []
+    for execution in dict.fromkeys(cell["execution"] for cell in cells):
+        own = {cell["delay"]: cell for cell in cells if cell["execution"] == execution}
+        rows.append([execution, *(own[wait]["success [95 %]"] for wait in waits), own[waits[-1]]["seam jump"]])
+    head = ["execution", *(f"delay {wait}: success [95 %]" for wait in waits), f"delay {waits[-1]}: seam jump"]
+    return _table(head, rows)
 
 
 def _read_judged(file: Path) -> Any:
@@ -343,7 +332,7 @@ def _read_marks(file: Path) -> list[MarkedVariant]:
 
 
 _OF_BENCHMARKS = (
-    *(headline, main_job, whole_calls, image_sizes, lines_over_steps, joins, batches),
+    *(headline, main_job, whole_calls, image_sizes, joins, batches),
     *(errors, ready, kernels, machine),
 )
 TABLES = {

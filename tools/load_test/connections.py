@@ -10,7 +10,7 @@ from typing import Any, Literal
 from load_test.schedule import Refused
 
 Kind = Literal["turbopi", "openpi", "bare"]
-# How a server's text frames begin, docs/serving.md. Another text is a traceback.
+# How a server's text frames begin, docs/serving_protocol.md. Another text is a traceback.
 TEXTS = (
     "bad request",
     "bad observation",

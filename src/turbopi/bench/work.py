@@ -15,7 +15,7 @@ _Count = Annotated[int, Meta(ge=1)]
 Join = Literal["none", "held", "identity", "jacobian"]
 JOINS: dict[Join, str] = {  # how a chunk joins a running one (docs/real_time.md), and what the table calls it
     "none": "",
-    "held": "the first actions held",
+    "held": "the first actions fixed",
     "identity": "guided by the identity",
     "jacobian": "guided by the Jacobian",
 }

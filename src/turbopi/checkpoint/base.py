@@ -73,11 +73,9 @@ class Checkpoint:
         return self.source.format
 
     def load(self, device: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
-        """Read all weights straight into their final dtype and device, or where a room has them, a piece at a time.
+        """Read all weights into their final dtype and device, piece by piece.
 
-        Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
-        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`;
-        its kind GraphsOnly for an ONNX export.
+        Raises CheckpointError if a value is NaN or infinite, and as `check_hash`; for an ONNX export GraphsOnly.
         """
         self.check_hash()
         room = OneDevice(torch.device(device)) if isinstance(device, (str, torch.device)) else device
@@ -103,7 +101,7 @@ class Checkpoint:
         return Loaded(state, time.perf_counter() - began, total)
 
     def check_hash(self) -> None:
-        """CheckpointError if the configuration has the weights' SHA-256 and theirs is another. Reads them all then."""
+        """Raise CheckpointError if the weights' SHA-256 isn't the one in the configuration, if it has one."""
         if self.expected_sha256 is not None and self.fingerprint() != self.expected_sha256:
             raise CheckpointError(
                 f"{self.path}: {self.config_source} says that the weights' SHA-256 is {self.expected_sha256}, but it "
@@ -113,9 +111,8 @@ class Checkpoint:
     def fingerprint(self, *, trust_files: bool = False) -> str:
         """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian).
 
-        The format and the stored dtype don't enter it: the same numbers have the same fingerprint in any of them.
-        Random weights are hashed by what they are made from. Reads everything, once per object, unless `trust_files`:
-        then what was read earlier holds for files that look unchanged (known_hashes.py).
+        Independent of the format and the stored dtype. Reads all weights, once per object; with `trust_files` the
+        cached hash of files that look unchanged is used (known_hashes.py).
         """
         if not trust_files or "_fingerprint" in self.__dict__:
             return self._fingerprint

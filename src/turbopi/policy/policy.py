@@ -51,31 +51,27 @@ class UnifiedPolicy:
         actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
 
     Args:
-        checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or a `Checkpoint` that is open already.
-        config: what no checkpoint records (robot, statistics, horizon, …): a preset's name, a .json, a PolicyConfig, or
-            "auto" for LeRobot's own config or the `turbopi.json` beside the weights.
-        backend: a name from `turbopi backends`; "auto" takes the fastest one available and says which in `metadata`.
-        precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
-            (docs/quantization.md).
-        quantization: what `turbopi calibrate` wrote for this checkpoint, for these precisions alone. None: the
-            `turbopi_fp8.json` or `turbopi_int8.json` beside the weights.
-        num_denoising_steps: evaluations of the action expert in a call, unless `infer` is told otherwise. None: the
-            config's, which has them from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
-        solver: "euler", as openpi, "midpoint", "heun", "ab2" or "exponential": docs/performance.md. None: the config's.
-        time_grid: "uniform", as openpi, "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1
-            (noise) to 0, which bring their number of steps. None: the config's.
+        checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or an open `Checkpoint`.
+        config: what no checkpoint records: a preset's name, a .json, a PolicyConfig, or "auto" for LeRobot's own config
+            or the `turbopi.json` beside the weights.
+        backend: a name from `turbopi backends`; "auto" takes the fastest one available (see `metadata`).
+        precision: "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8" (docs/quantization.md).
+        quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
+        num_denoising_steps: evaluations of the action expert in a call. None: the config's.
+        solver: "euler", "midpoint", "heun", "ab2" or "exponential" (docs/performance.md). None: the config's.
+        time_grid: "uniform", "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1 (noise) to 0,
+            which determine the number of steps. None: the config's.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache.
-        default_prompt: the instruction for observations that bring none.
+        default_prompt: for observations without a prompt.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
-        strict: refuse, with an ObservationError, a call that warm-up didn't cover and the backend would capture or
-            compile for, which takes from a second to a minute in the middle of a robot's motion. See `warmup`.
+        strict: refuse calls that `warmup` didn't cover, with an ObservationError, instead of compiling while a robot
+            moves.
 
-    Raises ConfigError, CheckpointError, CalibrationError, TokenizerError or BackendUnavailable, each with what to do
-    about it.
-    Calls from several threads are served one at a time.
+    Raises ConfigError, CheckpointError, CalibrationError, TokenizerError or BackendUnavailable, each with what to do.
+    Calls from several threads take turns.
     """
 
     def __init__(
@@ -158,36 +154,32 @@ class UnifiedPolicy:
 
         Args:
             obs: the observation under the robot's own keys (docs/robots.md), on the host, without a batch axis.
-            noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. Given noise, or a seed, makes the result
+            noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. With noise or a seed the result is
                 deterministic.
-            seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
-            num_steps, solver, time_grid: for this call alone, as the policy's `num_denoising_steps` and so on.
-            horizon: actions of the chunk, H, for this call alone. None: the config's, which the weights were trained
-                for and openpi has no other than. All actions of a chunk attend to each other, so a shorter chunk isn't
-                the beginning of a longer one. Backends with engines for one horizon refuse another.
-            previous: the chunk that the robot is carrying out, which this one is to join (docs/real_time.md). What can
-                be asked for is in `metadata["real_time"]`.
-            conditioning: instead of `previous`, what exactly the denoising loop is to do (models/pi0/conditioning.py).
-                One with times or a solver of its own brings its number of steps.
-            model_actions: also return what a later call's `previous` needs, see below.
+            seed: of the noise, by `numpy.random.default_rng(seed)`. Without both: fresh noise every call.
+            num_steps, solver, time_grid: for this call only.
+            horizon: actions of the chunk, H, for this call only. None: the config's, which the weights are trained for.
+                A shorter chunk isn't the beginning of a longer one. Engines for one horizon refuse others.
+            previous: the previous chunk, which this one continues (docs/real_time.md); modes: `metadata["real_time"]`.
+            conditioning: instead of `previous`, exact instructions to the denoising loop (models/pi0/conditioning.py).
+                One with its own times or solver determines the number of steps.
+            model_actions: also return what the next call's `previous` needs.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
-            preprocess_ms    reading, resizing, tokenising, up to the model
+            preprocess_ms    reading, resizing, tokenising
             queue_ms         waiting for calls of other threads
-            infer_ms         the model alone, from inputs on the host to actions on the host, as openpi counts. With a
-                             backend that starts on the pictures (`begin`), tokenising runs beside it and is in it
+            infer_ms         the model alone, from inputs on the host to actions on the host, as in openpi
             vision_ms, prefix_ms, denoise_ms
-                             stages of infer_ms on the device, where the backend can tell them apart. prefix_ms begins
-                             where vision ends: time in which the device waits for the host is in it
+                             stages of infer_ms on the device, where the backend can separate them
             postprocess_ms   un-normalising and the robot's own outputs
             total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
 
-        With `model_actions` also "model_actions": float32[H, action_dim], in the model's normalised space, and if the
-        policy's actions are relative to the state "anchor": float64[d], that state in their units.
+        With `model_actions` also "model_actions": float32[H, action_dim], normalised, and for relative actions
+        "anchor": float64[d], the state that they are relative to.
 
-        Raises ObservationError for anything wrong with the arguments, naming it; ActionError if an action is NaN or
-        infinite; DeviceLost once the GPU has failed for good (`lost`).
+        Raises ObservationError for wrong arguments, ActionError if an action is NaN or infinite, DeviceLost once the
+        GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
@@ -211,17 +203,15 @@ class UnifiedPolicy:
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
 
-        `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
-        number, or one for each row. `conditioning` and `previous` are lists with one for each row, or None for a row
-        that joins nothing; `model_actions` is for all rows, or a list with one for each. What is wrong with a row is
-        said with its number. All rows take the same number of denoising steps: `num_steps`, else what a row's
-        conditioning brings, else the policy's.
+        `noise` is [B, H, action_dim]; `seed` is the first row's, the next row has the next number, or one for each row.
+        `conditioning` and `previous` have one entry for each row, None for an unconditioned one; `model_actions` is one
+        flag or one for each row. All rows take the same number of denoising steps. Errors name the row.
 
-        `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
-        splits other numbers (`backend.batch_costs`). Observations may differ in cameras, prompts and what they join:
-        rows with times, held actions or identity guidance run together with plain ones, rows guided by the true
-        Jacobian with each other. Actions then differ from what `infer` returns by as much as sums in another order do:
-        docs/performance.md. With another solver than Euler's they run one by one there.
+        If `runs_batches`, the backend computes 1, 2, 4, 8 or 16 observations together and splits other numbers; else
+        one by one, as with another solver than Euler's. Cameras and prompts may differ. Rows with fixed actions,
+        identity guidance or their own times run together with plain ones, rows guided by the true Jacobian with each
+        other.
+        Actions differ from those of `infer` by rounding (docs/performance.md).
         """
         rows = len(observations)
         own = of_each("conditioning", conditioning, rows, Conditioning)
@@ -271,8 +261,8 @@ class UnifiedPolicy:
     ) -> "Future[dict[str, Any]]":
         """`infer` that returns at once, with a Future of what `infer` returns; several may be in flight.
 
-        For the pipelined backends, which encode one observation while another is denoised. Other backends raise
-        ConfigError, unless `serially` says that running it now, before returning, will do.
+        For pipelined backends, which encode one observation while another is denoised. Other backends raise
+        ConfigError, or with `serially` run the call before they return.
         """
         if serially and not self.pipelined:
             done: Future[dict[str, Any]] = Future()
@@ -307,7 +297,7 @@ class UnifiedPolicy:
         return answer
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call knows of an earlier one."""
+        """A new episode, as openpi's `BasePolicy.reset`. A policy has no state between calls, so nothing happens."""
 
     def warmup(
         self,
@@ -321,24 +311,19 @@ class UnifiedPolicy:
     ) -> float:
         """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took.
 
-        Every prompt length is covered, for all combinations of:
+        Covers every prompt length, for all combinations of these, each a number or several:
 
-            cameras     numbers of cameras that observations have. None: all that the robot may send
-                        (`Robot.camera_counts`); backends whose engines take minutes to build skip those that aren't
-                        built yet, but for the example observation's
-            horizons    action horizons, see `infer`. None: the config's
+            cameras     numbers of cameras. None: all that the robot may send (`Robot.camera_counts`), but only engines
+                        that are built already
+            horizons    action horizons. None: the config's
             steps       numbers of denoising steps. None: the policy's
-            batches     sizes of the batches that `infer_batch` will be given, whose observations have any of these
-                        numbers of cameras on average, and join what `real_time` and `conditioning` say, or nothing.
-                        None: none, only single observations
-            real_time   modes of `RunningChunk` that calls will have, besides calls without one
+            batches     sizes of batches for `infer_batch`. None: single observations only
+            real_time   modes of `RunningChunk`, besides calls without one
             conditioning
-                        examples of other conditionings that they will have, each for its own steps and horizon alone:
-                        of a conditioning the form and the times count, not what is held or pulls
+                        examples of other conditionings, each for its own steps and horizon; only form and times count
 
-        each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
-        engine/graph_cache.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for
-        more loops than are kept.
+        What earlier calls covered stays covered, up to the graph cache's size. Raises ConfigError for impossible
+        values, and for more loops than the cache keeps.
         """
         start = time.perf_counter()
         self._guard.refuse_if_lost()
@@ -379,7 +364,7 @@ class UnifiedPolicy:
             logger.warning("warm-up: %s", error)
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
-        """What the model is given for an observation. Raises ObservationError if it can't be used."""
+        """The model's inputs for an observation. Raises ObservationError if it can't be used."""
         return self._pipeline.before(obs)[0]
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
@@ -388,11 +373,7 @@ class UnifiedPolicy:
 
     @property
     def lost(self) -> str | None:
-        """Why the GPU failed for good, and with it this process; None while it works.
-
-        Found out by the call that fails: it and all later ones raise DeviceLost with this reason, the later ones
-        without touching the GPU. Out of memory isn't such a failure.
-        """
+        """Why the GPU failed for good; None while it works. Every later call raises DeviceLost with this reason."""
         return self._guard.lost
 
     @property
@@ -408,10 +389,7 @@ class UnifiedPolicy:
 
     @property
     def loop_arguments(self) -> dict[str, Any]:
-        """What the backend's own methods are told of this policy's solver and time grid: nothing, if they are openpi's.
-
-        For whoever calls `backend` itself, with `metadata["num_denoising_steps"]`.
-        """
+        """This policy's solver and time grid, as arguments of the backend's own methods; empty for openpi's."""
         asked = self._denoising.integration
         return {} if asked is None else {"conditioning": Conditioning(integration=asked)}
 
@@ -427,7 +405,7 @@ class UnifiedPolicy:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What this policy is: the server sends it to every client on connection. Plain values only."""
+        """Description of this policy, plain values only; the server sends it to every client."""
         model = self.config.model
         return {
             "config": self.config.name,

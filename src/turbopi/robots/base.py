@@ -19,10 +19,10 @@ from turbopi.support.errors import ObservationError
 
 @dataclass(frozen=True)
 class RobotInputs:
-    """An observation in the model's words.
+    """An observation in the model's terms.
 
     images      camera -> uint8[h, w, 3] in [0, 255], or float32[h, w, 3] in [0, 1] (LeRobot); RGB
-    image_mask  camera -> whether there is such a picture; left out: if `images` has one
+    image_mask  camera -> whether it is valid; left out: if `images` has it
     state       float[s]       in the robot's units, before normalisation
     prompt      the task, or None if the observation has none
     in_order    whether `images` has all of the model's cameras, in its order, whatever their names
@@ -62,7 +62,7 @@ class Robot(Protocol):
 
     @abstractmethod
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
-        """An observation as its client sends it, in the model's words. Raises ObservationError."""
+        """The observation that a client sent, in the model's terms. Raises ObservationError."""
         ...
 
     @abstractmethod

@@ -3,7 +3,7 @@
 A client may keep the running chunk itself: it asks for "model_actions", and sends what is left of them as
 "turbopi/previous". Or the server keeps it, in a session: then the server must know how many actions the robot has
 carried out since the observation of the chunk before, and how many it will until the new chunk is there.
-docs/serving.md says from what; what isn't known is refused, never guessed.
+docs/serving_sessions.md says from what; what isn't known is refused, never guessed.
 """
 
 import math

@@ -10,7 +10,8 @@
 
 The event loop only moves and decodes bytes; the policy runs on the worker's thread, so health checks, pings and other
 clients are served while it does. listener.py lets clients in, connection.py reads what they send no faster than they
-may send it. See docs/serving.md for the limits, and for what differs from openpi's own server.
+may send it. See docs/serving_security.md for the limits, docs/serving_protocol.md for what differs from openpi's
+own server.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """How soon a request wants its answer, and for whom: optional keys of a message, which the policy never sees.
 
-docs/serving.md has them as a table.
+docs/serving_sessions.md has them as a table.
 """
 
 from collections.abc import Mapping

@@ -19,9 +19,9 @@ PLAIN = {  # by name: the runs without delay, and the controls
     "float32": "`pytorch`, float32",
     "fused": "`fused`, bfloat16",
     "prompt": "control: the prompt of another task",
-    "pictures": "control: the pictures of another task",
+    "pictures": "control: the images of another task",
 }
-DELAYED = {  # by name: the way to run and its delay
+DELAYED = {  # by name: the execution mode and its delay
     "async_2": ("async", 2),
     "rtc_trained_2": ("rtc_trained", 2),
     "async_4": ("async", 4),
@@ -128,7 +128,7 @@ def table(judged: Judged) -> list[str]:
 def delayed_table(judged: Judged) -> list[str]:
     """Of the ways to run under delay, paired with the first run, in Markdown."""
     return [
-        "| way to run | delay | solved | success [95 %] | against float32 without delay | seam jump |",
+        "| execution | delay | solved | success [95 %] | against float32 without delay | seam jump |",
         "|---|--:|---|---|---|--:|",
     ] + [_delayed(*way, judged.runs[name]) for name, way in DELAYED.items()]
 
