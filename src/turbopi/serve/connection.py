@@ -27,9 +27,7 @@ from turbopi.serve.zero_copy import SpareBuffer, ZeroCopyFrame, apply_mask, is_z
 MAX_UNANSWERED = 2  # messages of one client: one that is computed, one that waits
 READ_BYTES = 512 * 1024  # at most, in one read of a socket: two images of 224 x 224 are 300 KB
 BYTES_OF_ONE_WORK = 65536
-DISCARD_PAUSE_SECONDS = (
-    0.002  # between reads of what is thrown away: 128 MB/s and more, so that a client gets to read why
-)
+DISCARD_PAUSE_SECONDS = 0.002  # between reads of discarded bytes: 128 MB/s and more, so that a client gets to read why
 WORK_OF_A_SECOND = 4000.0  # of decoding: 5 * Limits.work_total_rate, so all who are slowed get a fifth of the loop
 WORK_OF_A_REFUSAL = 3.0  # to find the error, send and log it
 
@@ -351,7 +349,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
     def _pause_reading_briefly(self) -> None:
         """Read on in a moment: what has no use may come without end until its deadline."""
         self._set_reading(False)
-        self._once("breathe", DISCARD_PAUSE_SECONDS, lambda: self._set_reading(True))
+        self._once("discard", DISCARD_PAUSE_SECONDS, lambda: self._set_reading(True))
 
     def _set_reading(self, on: bool) -> None:
         if on:
@@ -378,7 +376,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
     def _watch_progress(self, blocked: bool) -> None:
         """Half a message or frame must go on, unless it is this server that doesn't read on."""
         half = bool(self._payload_left or self._message or self._backlog) and self.protocol.state is State.OPEN
-        if not half or (blocked and "retry" not in self._timers):  # who is slowed must still end what it began
+        if not half or (blocked and "retry" not in self._timers):  # a slowed client must still end what it began
             self._cancel("progress")
         elif "progress" not in self._timers:
             begun = self._handed_over

@@ -124,7 +124,7 @@ class Refusal(NamedTuple):
     text: str
 
 
-class Answer(NamedTuple):
+class Reply(NamedTuple):
     """The map to send, with "server_timing", and what the request said about scheduling."""
 
     result: dict[str, Any]
@@ -191,8 +191,8 @@ class RequestHandler:
         self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
-    async def handle(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> Answer | Refusal:
-        """The answer to a message. Raises PolicyFailed and ClientLeft."""
+    async def handle(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> Reply | Refusal:
+        """The reply to a message. Raises PolicyFailed and ClientLeft."""
         if (lost := self._why_lost()) is not None:
             return Refusal("lost", REFUSALS["lost"].format(lost))
         try:
@@ -205,7 +205,7 @@ class RequestHandler:
         failed = first_error(request, results)
         self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
         if failed is None:
-            return Answer(self._answer(request, results), request.scheduling)
+            return Reply(self._answer(request, results), request.scheduling)
         if failed.error == "policy":
             raise PolicyFailed(failed.text)
         assert failed.error is not None

@@ -150,10 +150,10 @@ class RemoteCalls:
             raise
         except (RayActorError, RpcError):
             return self._lost(requested, "its process ended, or can't be reached, during this request; ask again")
-        return self._recorded(answer, time.perf_counter() - requested)
+        return self._record(answer, time.perf_counter() - requested)
 
-    def _recorded(self, answer: Answer, total: float) -> Result:
-        """The result, its times in the metrics. `total`: seconds since it was requested here."""
+    def _record(self, answer: Answer, total: float) -> Result:
+        """Count its times in the metrics, and return the result. `total`: seconds since it was requested here."""
         result = answer.result
         if result.error == "stopping":
             return Result(0.0, error="busy", text="busy: the replica is being replaced; try again")

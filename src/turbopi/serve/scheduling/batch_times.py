@@ -53,11 +53,8 @@ class BatchTimes:
         self.largest = largest
         self._warm: dict[int, _Times] = {}
         self._recent: dict[int, _Times] = {}
-        self._failed, self._failed_until, self._pause = (
-            0,
-            -math.inf,
-            PAUSE,
-        )  # the size that failed, and until when it counts
+        # The size that failed, until when it isn't formed, and for how long after the next failure.
+        self._failed, self._failed_until, self._pause = 0, -math.inf, PAUSE
         # A cache: the schedule needs the same values many times while clients wait. It holds from one moment to
         # another, and until a time is added.
         self._seconds: dict[tuple[int, float], float | None] = {}

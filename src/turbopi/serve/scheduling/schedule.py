@@ -367,10 +367,8 @@ class Schedule:
 
     def _next_expiry(self, now: float) -> float | None:
         """When the first of those that wait can't meet its deadline any more, if nothing happens before."""
-        moments = [
-            request.deadline - self._seconds(request, now) + EXPIRY_MARGIN for request in self._waiting if request.firm
-        ]
-        return min(moments, default=None)
+        moments = [one.deadline - self._seconds(one, now) for one in self._waiting if one.firm]
+        return min(moments) + EXPIRY_MARGIN if moments else None
 
     def _order(self, now: float) -> Callable[[Request], tuple[float, ...]]:
         """Robots first, then in a crowd the strongest claim, then the earliest deadline, then who came first."""
@@ -387,9 +385,8 @@ class Schedule:
         head, exhausted = self._head(now)
         group = self._candidates(head, now)
         rows = sum(request.rows for request in group)
-        until = (
-            -math.inf if exhausted or head.alone or len(group) < self.waiting else self._batch_window(group, rows, now)
-        )
+        waits = not (exhausted or head.alone or len(group) < self.waiting)
+        until = self._batch_window(group, rows, now) if waits else -math.inf
         if until > now:
             return Decision((), refused, until if wake is None else min(until, wake))
         turn = self._best_turn(group, now)

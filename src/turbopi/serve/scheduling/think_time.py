@@ -53,12 +53,10 @@ class ThinkTimes:
         found = []
         for source, answered in self._answered.items():
             usual = self._usual(source)
-            if (
-                usual is not None
-                and source not in but
-                and (last := answered + usual * GIVE_UP_FACTOR + GIVE_UP_SECONDS) > now
-            ):
-                found.append((answered + usual, last))
+            if usual is not None and source not in but:
+                last = answered + usual * GIVE_UP_FACTOR + GIVE_UP_SECONDS
+                if last > now:
+                    found.append((answered + usual, last))
         return sorted(found)
 
     def _usual(self, source: Hashable) -> float | None:
