@@ -172,7 +172,7 @@ def _serve(
         fleet.check_is_fleet(options.name)
         if options.name in fleet.names():
             _check_orphan(options.name, asked.policy, opened, output)
-        fleet.check_room(options)
+        fleet.check_capacity(options)
         try:
             _deploy(options, asked, checkpoint, output)
             policies = fleet.Fleet.attach(options.name)
@@ -208,7 +208,7 @@ def _update(wishes: FleetWishes, asked: Asked, checkpoint: str | None, output: O
     opened = _open(asked, checkpoint, output)
     check_fits(running.metadata, opened.config.model.action_horizon, robot_of(asked.policy, opened))
     options = scaled_as(wishes.options(asked, checkpoint), before, given)
-    fleet.check_room(options)
+    fleet.check_capacity(options)
     after = asked.plain() | scale_of(options, *fleet.planned(options))
     if ignored := of_the_front(given, after):
         output.line(f"note: {', '.join(ignored)}: of the server in front, which an update leaves as it is", "yellow")

@@ -154,7 +154,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._owner.connected(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self._shared.scratch if self._zero_copy is None else self._zero_copy.room
+        return self._shared.scratch if self._zero_copy is None else self._zero_copy.free
 
     def buffer_updated(self, nbytes: int) -> None:
         if self._zero_copy is None:

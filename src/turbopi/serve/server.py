@@ -258,7 +258,7 @@ class PolicyServer:
             if is_feed(connection.request):
                 self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
-            self._live.joined(connection)
+            self._live.connected(connection)
         self.metrics.clients.inc()
         self._log.info(f"{peer(connection)} connected", "connections")
         try:
@@ -281,7 +281,7 @@ class PolicyServer:
             self._real_time.closed(connection)
             self.metrics.clients.dec()
             if self._live is not None:
-                self._live.left(connection)
+                self._live.disconnected(connection)
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""

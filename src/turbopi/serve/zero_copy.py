@@ -42,25 +42,25 @@ class SpareBuffer:
 
 
 class ZeroCopyFrame:
-    """The payload of one frame while it comes. `room` is where its next bytes go, and is empty at its end."""
+    """The payload of one frame while it comes. `free` is where its next bytes go, and is empty at its end."""
 
     def __init__(self, spare: SpareBuffer, length: int, mask: bytes) -> None:
         self._spare, self._length, self._mask = spare, length, mask
         self._buffer = spare.take(length)
-        self.room = memoryview(self._buffer)[:length]
+        self.free = memoryview(self._buffer)[:length]
 
     def add(self, data: bytes | memoryview) -> None:
         """Take bytes that were received elsewhere, no more than there is room for."""
-        self.room[: len(data)] = data
+        self.free[: len(data)] = data
         self.received(len(data))
 
     def received(self, size: int) -> None:
-        """So many bytes were written into `room`."""
-        self.room = self.room[size:]
+        """So many bytes were written into `free`."""
+        self.free = self.free[size:]
 
     def message(self) -> bytes:
         """The payload without its mask. To be called once: then the buffer is the next frame's."""
-        assert not self.room
+        assert not self.free
         message = apply_mask(memoryview(self._buffer)[: self._length], self._mask)
         self._spare.give_back(self._buffer)
         return message

@@ -182,7 +182,7 @@ def planned(options: FleetOptions) -> tuple[int, bool]:
     return options.replicas or (max(gpus, 1) if use_gpus else 1), use_gpus
 
 
-def check_room(options: FleetOptions) -> None:
+def check_capacity(options: FleetOptions) -> None:
     """Raise BackendUnavailable if the cluster hasn't the GPUs or CPUs for the fleet: Ray would wait for more machines.
 
     What a running fleet of that name has counts as free: its replicas are replaced one after the other.
@@ -306,10 +306,10 @@ def check_known(autoscaling: Mapping[str, Any]) -> None:
         )
 
 
-def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
+def deploy(application: Any, name: str, report: Callable[[str], None]) -> None:
     """Start the replicas, or replace those of a fleet of that name one after the other, and wait until all serve.
 
-    `tell` gets what Ray says meanwhile. Raises BackendError if a replica can't start, with the reason.
+    `report` gets what Ray says meanwhile. Raises BackendError if a replica can't start, with the reason.
     """
     _, serve = import_ray()
     serve.start(proxy_location="Disabled", logging_config=QUIET)  # the server in front has the port; once is enough
@@ -325,7 +325,7 @@ def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
             raise BackendError(f"the replicas of {name!r} can't start: {reason_in(message or state.message)}")
         if message and message != last:
             last = message
-            tell(reason_in(message))
+            report(reason_in(message))
         time.sleep(POLL_SECONDS)
 
 

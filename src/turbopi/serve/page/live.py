@@ -133,13 +133,13 @@ class Live:
         await asyncio.gather(*self._pending)
         self._thread.shutdown(wait=False)
 
-    # --- what robots do -----------------------------------------------------------------------------------------------
+    # --- robots -------------------------------------------------------------------------------------------------------
 
-    def joined(self, connection: GuardedConnection) -> None:
+    def connected(self, connection: GuardedConnection) -> None:
         self._known += 1
         self._robots[connection] = _Robot(self._known, peer(connection), time.time())
 
-    def left(self, connection: GuardedConnection) -> None:
+    def disconnected(self, connection: GuardedConnection) -> None:
         self._robots.pop(connection, None)
 
     def answered(
@@ -209,8 +209,8 @@ class Live:
     async def _frame(self, sent: dict[int, int]) -> str:
         moment = self._moment(sent)
         sent.update({robot.id: robot.preview.number for robot in moment.robots if robot.preview is not None})
-        for left in sent.keys() - {robot.id for robot in moment.robots}:
-            del sent[left]
+        for robot_id in sent.keys() - {robot.id for robot in moment.robots}:
+            del sent[robot_id]
         return await asyncio.get_running_loop().run_in_executor(self._thread, _frame_of, moment, self._memory)
 
     def _moment(self, sent: Mapping[int, int]) -> _Moment:

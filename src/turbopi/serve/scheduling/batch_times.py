@@ -144,10 +144,10 @@ class BatchTimes:
         longest  seconds that the run may take; one observation may take longer
         """
         most = min(rows, self.formed_largest(now))
-        alone = self.seconds(1, now) if most > 1 else None
-        if alone is None:
+        single = self.seconds(1, now) if most > 1 else None
+        if single is None:
             return 1
-        best, best_each = 1, alone * GAIN
+        best, best_each = 1, single * GAIN
         for size in range(2, most + 1):
             seconds = self.seconds(size, now)
             assert seconds is not None  # as a size that is no smaller was measured
@@ -161,11 +161,11 @@ class BatchTimes:
             return self.seconds(1, now) or 0.0
         self._expire(now)
         if rows not in self._totals:
-            seconds, left = 0.0, rows
-            while left > 0:
-                best = self.best(left, now)
-                runs = left // best
+            seconds, remaining = 0.0, rows
+            while remaining > 0:
+                best = self.best(remaining, now)
+                runs = remaining // best
                 seconds += runs * (self.seconds(best, now) or 0.0)
-                left -= runs * best
+                remaining -= runs * best
             self._totals[rows] = seconds
         return self._totals[rows]

@@ -357,9 +357,9 @@ class Schedule:
         return self._joining if any(request.joins for request in requests) else self._turns
 
     def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
-        since, deadline = now - request.arrived, request.deadline - request.arrived
+        waited, deadline = now - request.arrived, request.deadline - request.arrived
         text = (
-            f"late: {since * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
+            f"late: {waited * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
             f"more ({wait * 1e3:.1f} ms until its turn, {run * 1e3:.1f} ms in the policy), but its deadline is "
             f"{deadline * 1e3:.1f} ms: ask earlier, or give it more time"
         )
