@@ -60,14 +60,14 @@ class FakePolicy:
 def deploy(generation: int | None, autoscaling: dict[str, Any] | None = None) -> None:
     replicas = 2 if autoscaling is None else None
     options = fleet.FleetOptions(NAME, "fake", replicas=replicas, cpus=0.25, autoscaling=autoscaling)
-    fleet.deploy(fleet.replicas(partial(FakePolicy, generation), options, warm=None), NAME, tell=lambda text: None)
+    fleet.deploy(fleet.replicas(partial(FakePolicy, generation), options, warm=None), NAME, report=lambda text: None)
 
 
 def command(do: str, **given: Any) -> dict[str, Any]:
     if do == "deploy":
         deploy(**given)
     elif do == "room":
-        fleet.check_room(fleet.FleetOptions("gpus", "gpus", replicas=given["replicas"], use_gpus=True))
+        fleet.check_capacity(fleet.FleetOptions("gpus", "gpus", replicas=given["replicas"], use_gpus=True))
     else:
         assert do == "build"
         fleet.import_ray()[1].run(build(given["arguments"]), name="whole", route_prefix="/")

@@ -1,5 +1,6 @@
 """What the documents say: their tables and plots are the result files', their links lead somewhere."""
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -42,6 +43,22 @@ def test_links_lead_to_files_and_headings(document: Path) -> None:
         assert target.exists(), f"{link} leads nowhere"
         if anchor:
             assert anchor in headings(target), f"{link}: {target.name} has no such heading"
+
+
+_CODE = re.compile(r"`([a-z0-9_/]+\.py):([A-Za-z_.]+)`")
+_DEFINITIONS = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def test_the_code_that_the_request_page_names_exists() -> None:
+    """docs/dev/request.md names functions as `path.py:Class.function`, below src/turbopi/."""
+    named = _CODE.findall((ROOT / "docs/dev/request.md").read_text(encoding="utf-8"))
+    assert len(named) > 20
+    for path, name in named:
+        body = ast.parse((ROOT / "src/turbopi" / path).read_text(encoding="utf-8")).body
+        for part in name.split("."):
+            found = [one for one in body if isinstance(one, _DEFINITIONS) and one.name == part]
+            assert found, f"{path} has no {name}"
+            body = found[0].body
 
 
 _WITHOUT_A_FILE = re.compile(

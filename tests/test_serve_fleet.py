@@ -32,7 +32,7 @@ from turbopi.serve.fleet.remote_calls import RemoteCalls
 from turbopi.serve.fleet.replica import Line, Replica
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import Result
 from turbopi.serve.scheduling.schedule import Request
 from turbopi.support.errors import ConfigError
 
@@ -67,20 +67,20 @@ def replicated(
 def test_a_replica_answers_with_actions_or_whose_fault_it_is() -> None:
     async def test(replica: Replica, policy: FakePolicy) -> None:
         answer = await replica.infer(observation("left"), {})
-        outcome = answer.outcome
-        assert outcome.result is not None and outcome.result["prompt"] == "left"
-        assert answer.checkpoint == "weights" and answer.seconds >= outcome.seconds > 0
+        result = answer.result
+        assert result.answer is not None and result.answer["prompt"] == "left"
+        assert answer.checkpoint == "weights" and answer.seconds >= result.seconds > 0
         for obs, wrong in (
             ({}, "observation"),
             (observation("nan actions"), "actions"),
             (observation("answer nan"), "actions"),
             (observation("crash"), "policy"),
         ):
-            assert (await replica.infer(obs, {})).outcome.wrong == wrong
+            assert (await replica.infer(obs, {})).result.error == wrong
         replica.check_health()
         assert not policy.warmed_up
         assert await replica.about() == policy.metadata
-        assert await replica.asked() == {"steps": 3}
+        assert await replica.started_with() == {"steps": 3}
 
     replicated(test)
 
@@ -100,7 +100,7 @@ def test_a_full_replica_says_so_and_a_request_that_is_given_up_never_runs() -> N
         await asyncio.to_thread(policy.started.wait, 60)
         waiting = asyncio.ensure_future(replica.infer(observation("waits"), {}))
         await asyncio.sleep(0)
-        assert (await replica.infer(observation("one too many"), {})).outcome.wrong == "busy"
+        assert (await replica.infer(observation("one too many"), {})).result.error == "busy"
         waiting.cancel()
         policy.release.set()
         await held
@@ -114,8 +114,8 @@ def test_a_lost_device_is_told_and_ends_the_process() -> None:
     ended = asyncio.Event()
 
     async def test(replica: Replica, policy: FakePolicy) -> None:
-        outcome = (await replica.infer(observation("lost"), {})).outcome
-        assert outcome.wrong == "lost" and "illegal memory access" in outcome.text
+        result = (await replica.infer(observation("lost"), {})).result
+        assert result.error == "lost" and "illegal memory access" in result.text
         with pytest.raises(RuntimeError, match="the device is lost: CUDA error"):
             replica.check_health()
         await ended.wait()
@@ -130,11 +130,11 @@ class SecondTimeWell(RemoteCalls):
         super().__init__(None, metrics, 60.0, on_lost=on_lost)
         self.asked = 0
 
-    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Outcome:
+    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Result:
         self.asked += 1
         if self.asked == 1:
-            return Outcome(0.0, wrong="replica", text="its process ended during this request; ask again")
-        return Outcome(0.0, result={"actions": np.zeros((2, 8))})
+            return Result(0.0, error="replica", text="its process ended during this request; ask again")
+        return Result(0.0, answer={"actions": np.zeros((2, 8))})
 
 
 def test_a_robot_is_told_of_a_lost_replica_and_keeps_its_connection() -> None:
@@ -162,10 +162,10 @@ def test_our_client_keeps_its_connection_too() -> None:
 def test_a_request_that_comes_at_the_moment_when_ray_ends_is_answered() -> None:
     async def main() -> None:
         calls = RemoteCalls(None, Metrics(), 60.0)
-        answer = calls.ask(Request(0.0, 1.0), observation(), {})
+        answer = calls.submit(Request(0.0, 1.0), observation(), {})
         calls._lose("Ray's cluster has ended")
-        (outcome,) = await answer
-        assert outcome.wrong == "lost" and outcome.text == "Ray's cluster has ended"
+        (result,) = await answer
+        assert result.error == "lost" and result.text == "Ray's cluster has ended"
 
     asyncio.run(main())
 

@@ -16,7 +16,7 @@ from turbopi.serve.fleet import watch as fleet_watch
 from turbopi.serve.fleet.remote_calls import RemoteCalls
 from turbopi.serve.fleet.watch import Watch, answers
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import Result
 from turbopi.support.errors import DeviceLost
 
 MOST_SECONDS = 60.0
@@ -173,8 +173,8 @@ class Resting(RemoteCalls):
     def unwell(self) -> str | None:
         return Resting.why
 
-    async def run(self, *arguments: Any) -> Outcome:
-        return Outcome(0.0, result={"actions": [[0.0]]})
+    async def run(self, *arguments: Any) -> Result:
+        return Result(0.0, answer={"actions": [[0.0]]})
 
 
 def test_without_a_replica_health_says_why_and_robots_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,10 +29,10 @@ from turbopi.serve.metrics import Metrics
 from turbopi.serve.page import live
 from turbopi.serve.page.device import memory_of
 from turbopi.serve.page.live import BINS, Live, stage_times
-from turbopi.serve.page.messages import Frame, Hello, Look, clean
-from turbopi.serve.page.preview import THUMBNAIL, look_at, thumbnail
+from turbopi.serve.page.messages import Frame, Hello, Preview, clean
+from turbopi.serve.page.preview import THUMBNAIL, make_preview, thumbnail
 from turbopi.serve.scheduling.schedule import Schedule
-from turbopi.serve.scheduling.worker import Worker
+from turbopi.serve.worker import Worker
 
 HTML = (Path(turbopi.serve.page.__file__).parent / "page.html").read_text(encoding="utf-8")
 FEED = msgspec.json.Decoder(Hello | Frame)
@@ -95,13 +95,13 @@ async def closed(watcher: ClientConnection) -> int:
     return watcher.close_code
 
 
-async def seen(watcher: ClientConnection, connection: ClientConnection, prompt: str, **more: Any) -> Look:
-    """The look of an answered request. Asks again until one is looked at: not every call is."""
+async def seen(watcher: ClientConnection, connection: ClientConnection, prompt: str, **more: Any) -> Preview:
+    """The preview of an answered request. Sends it again until there is one: not every call has one."""
     while True:
         assert isinstance(await ask(connection, prompt, **more), dict)
         for shown in (await frame(watcher)).robots:
-            if shown.look is not None and shown.look.prompt == prompt:
-                return shown.look
+            if shown.preview is not None and shown.preview.prompt == prompt:
+                return shown.preview
 
 
 # --- the document -----------------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ def test_the_feed_tells_the_policy_then_what_robots_did() -> None:
             assert shown.actions == np.linspace(-1, 1, 14).reshape(2, 7).tolist()
             assert shown.numbers == {"observation/state": observation()["observation/state"].tolist()}
             assert shown.timing["infer"] == 3.0 and (shown.timing["request"] or 0) > 0
-            sent = shown.pictures["observation/image"]
+            sent = shown.images["observation/image"]
             assert (sent.width, sent.height) == (480, 60)
             small = np.asarray(Image.open(io.BytesIO(sent.jpeg)))
             assert small.shape == (28, THUMBNAIL, 3)
@@ -270,17 +270,17 @@ def test_the_feed_tells_the_policy_then_what_robots_did() -> None:
     served(test)
 
 
-def test_a_look_is_sent_once_to_each_watcher() -> None:
+def test_a_preview_is_sent_once_to_each_watcher() -> None:
     async def test(server: PolicyServer) -> None:
         async with connect(live_url(server)) as watcher, robot(server) as connection:
             first = await seen(watcher, connection, "once")
             calls = (await frame(watcher)).robots[0].calls
             later = [await frame(watcher) for _ in range(4)]
-            assert all(one.robots[0].look is None or one.robots[0].look.number > first.number for one in later)
-            assert later[-1].robots[0].look is None and later[-1].robots[0].calls == calls
+            assert all(one.robots[0].preview is None or one.robots[0].preview.number > first.number for one in later)
+            assert later[-1].robots[0].preview is None and later[-1].robots[0].calls == calls
             async with connect(live_url(server)) as other:  # who comes later is told what is known
-                got = (await frame(other)).robots[0].look
-                assert got is not None and got.prompt == "once" and got.pictures.keys() == {"observation/image"}
+                got = (await frame(other)).robots[0].preview
+                assert got is not None and got.prompt == "once" and got.images.keys() == {"observation/image"}
 
     served(test)
 
@@ -313,19 +313,19 @@ def test_a_clients_text_is_cut_and_keeps_its_direction() -> None:
 # --- what robots notice: nothing --------------------------------------------------------------------------------------
 
 
-def test_nothing_is_looked_at_while_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: list[int] = []
-    monkeypatch.setattr(live, "look_at", lambda number, *_: looked.append(number))
+def test_no_preview_is_made_while_no_page_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    previewed: list[int] = []
+    monkeypatch.setattr(live, "make_preview", lambda number, *_: previewed.append(number))
 
     async def test(server: PolicyServer) -> None:
         async with robot(server) as connection:
             for _ in range(5):
                 assert isinstance(await ask(connection), dict)
-            assert looked == []
+            assert previewed == []
             async with connect(live_url(server)) as watcher:
                 told = await frame(watcher)
                 assert told.robots[0].calls == 5 and told.latency[0].calls == 5  # what costs nothing is known
-                while not looked:
+                while not previewed:
                     await ask(connection)
 
     served(test)
@@ -334,13 +334,13 @@ def test_nothing_is_looked_at_while_nobody_watches(monkeypatch: pytest.MonkeyPat
 def test_a_look_that_takes_long_holds_nobody_up_and_drops_others(monkeypatch: pytest.MonkeyPatch) -> None:
     begun, go_on, numbers = threading.Event(), threading.Event(), list[int]()
 
-    def slow(number: int, *rest: Any) -> Look:
+    def slow(number: int, *rest: Any) -> Preview:
         numbers.append(number)
         begun.set()
         assert go_on.wait(120)
-        return look_at(number, *rest)
+        return make_preview(number, *rest)
 
-    monkeypatch.setattr(live, "look_at", slow)
+    monkeypatch.setattr(live, "make_preview", slow)
     monkeypatch.setattr(live, "FRAMES_A_SECOND", 1e6)
 
     async def test(server: PolicyServer) -> None:
@@ -360,16 +360,16 @@ def test_a_look_that_takes_long_holds_nobody_up_and_drops_others(monkeypatch: py
 def test_a_fault_of_the_page_costs_no_robot_its_answer(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def broken(*_: Any) -> Look:
+    def broken(*_: Any) -> Preview:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(live, "look_at", broken)
+    monkeypatch.setattr(live, "make_preview", broken)
 
     async def test(server: PolicyServer) -> None:
         async with connect(live_url(server)) as watcher, robot(server) as connection:
             while "can't show a call" not in caplog.text:
                 assert isinstance(await ask(connection), dict)
-            assert (await frame(watcher, lambda frame: frame.robots)).robots[0].look is None
+            assert (await frame(watcher, lambda frame: frame.robots)).robots[0].preview is None
 
     with caplog.at_level(logging.ERROR):
         served(test)
@@ -447,7 +447,7 @@ def test_any_picture_becomes_a_small_jpeg(picture: np.ndarray) -> None:
         assert max(small.size) <= THUMBNAIL
 
 
-def test_a_look_never_fails_for_what_a_robot_sends() -> None:
+def test_a_preview_never_fails_for_what_a_robot_sends() -> None:
     strange = {
         "prompt": 3,
         "empty": np.zeros((0, 4, 3), np.uint8),
@@ -459,19 +459,19 @@ def test_a_look_never_fails_for_what_a_robot_sends() -> None:
         **{f"n{i}": np.array([1.5]) for i in range(20)},
     }
     for actions in (None, np.zeros(3), np.zeros((2, 2), np.int64), np.zeros((1000, 100)), np.full((1, 2), np.nan)):
-        made = look_at(1, 0.0, pack(strange), {"actions": actions}, {})
-        assert list(made.pictures) == ["nested/deep"] and made.prompt == "" and len(made.numbers) == 4
+        made = make_preview(1, 0.0, pack(strange), {"actions": actions}, {})
+        assert list(made.images) == ["nested/deep"] and made.prompt == "" and len(made.numbers) == 4
         assert len(made.actions) == (1 if isinstance(actions, np.ndarray) and actions.shape == (1, 2) else 0)
         msgspec.json.encode(made)
 
 
-def test_a_large_observation_is_not_kept_to_be_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_observation_is_not_stored_for_its_preview(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "MESSAGE_BYTES", 10)
 
     async def test(server: PolicyServer) -> None:
         async with connect(live_url(server)) as watcher, robot(server) as connection:
             made = await seen(watcher, connection, "")
-            assert made.pictures == {} and len(made.actions) == 2 and "too large to be shown" in made.note
+            assert made.images == {} and len(made.actions) == 2 and "too large to be shown" in made.note
 
     served(test)
 

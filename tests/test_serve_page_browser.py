@@ -115,7 +115,7 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
         # its picture, in its colour
         red, green, _ = page.value(COLOUR)
         assert abs(red - 200) < 8 and green < 8
-        assert "front\n64 × 32" in text(page, ".pictures")
+        assert "front\n64 × 32" in text(page, ".images")
         # the chunk: a line a dimension, from the bottom left to the top right for the first
         titles = page.value("[...document.querySelectorAll('.plot h4')].map((title) => title.firstChild.textContent)")
         assert titles == ["translation", "rotation", "gripper"]

@@ -17,7 +17,7 @@ from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import PolicyServer
-from turbopi.serve.scheduling import worker as worker_module
+from turbopi.serve import worker as worker_module
 
 Test = Callable[[PolicyServer, PipelinedFakePolicy], Awaitable[None]]
 

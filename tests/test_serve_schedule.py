@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbopi.serve.scheduling.batch_times import FRESH_SECONDS, GAIN, KEPT, LONGEST_PAUSE, PAUSE, BatchTimes
+from turbopi.serve.scheduling.batch_times import FRESH_SECONDS, GAIN, HISTORY, LONGEST_PAUSE, PAUSE, BatchTimes
 from turbopi.serve.scheduling.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
-from turbopi.serve.scheduling.think_time import MOST, Returns
+from turbopi.serve.scheduling.think_time import MAX_SOURCES, ThinkTimes
 
 T1 = 0.01
 PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}  # seconds by size, of an engine that batches
@@ -820,26 +820,26 @@ def test_a_client_that_left_is_waited_for_once() -> None:
     assert begin(schedule, 2.101) == others, "not for the one that left"
 
 
-def test_returns_are_forgotten_with_their_clients() -> None:
-    returns = Returns()
+def test_think_times_are_forgotten_with_their_clients() -> None:
+    times = ThinkTimes()
     for source in range(3000):
         for now in (0.0, 1.0):
-            returns.answered(source, now)
-            returns.asked(source, now + 0.001)
-        returns.answered(source, 2.0)
-    assert len(returns.expected(2.0, 1.0, ())) <= MOST
-    assert returns.expected(3.5, 1.0, ()) == [] and not returns._answered
+            times.answered(source, now)
+            times.requested(source, now + 0.001)
+        times.answered(source, 2.0)
+    assert len(times.expected(2.0, 1.0, ())) <= MAX_SOURCES
+    assert times.expected(3.5, 1.0, ()) == [] and not times._answered
 
 
 def test_one_slow_return_of_five_changes_nothing_and_two_do() -> None:
-    returns = Returns()
+    times = ThinkTimes()
     for now, seconds in enumerate((0.002, 0.002, 0.003, 0.002, 0.5, 0.5)):
-        returns.answered("robot", now)
-        returns.asked("robot", now + seconds)
-        returns.answered("robot", now + 0.6)
-        usual = [when - now - 0.6 for when, _ in returns.expected(now + 0.6, 1.0, ())]
+        times.answered("robot", now)
+        times.requested("robot", now + seconds)
+        times.answered("robot", now + 0.6)
+        usual = [when - now - 0.6 for when, _ in times.expected(now + 0.6, 1.0, ())]
         assert usual == ([] if now == 0 else pytest.approx([{3: 0.003, 4: 0.003, 5: 0.5}.get(now, seconds)])), now
-        returns._answered.clear()
+        times._answered.clear()
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -869,7 +869,7 @@ def test_a_size_without_times_of_its_own_gets_them_by_running() -> None:
 
 def test_the_last_times_alone_count() -> None:
     times = BatchTimes()
-    for number in range(2 * KEPT):
+    for number in range(2 * HISTORY):
         times.ran(1, float(number), float(number))
     assert times.seconds(1, 99.0) == 74.0  # the median of 50 to 99
     assert times.seconds(1, 99.0, 0.95) == 97.0
@@ -881,7 +881,7 @@ def test_a_quantile_is_one_of_the_last_times_and_no_less_than_that_part(values: 
     times = BatchTimes()
     for number, value in enumerate(values):
         times.ran(1, value, float(number))
-    last, found = values[-KEPT:], times.seconds(1, float(len(values)), part)
+    last, found = values[-HISTORY:], times.seconds(1, float(len(values)), part)
     assert found in last
     assert found is not None and sum(value <= found for value in last) >= part * len(last)
 

@@ -29,11 +29,17 @@ from turbopi.serve import PolicyServer, ServerOptions, running
 from turbopi.serve.calls import PolicyCalls
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.real_time import RealTime
-from turbopi.serve.rows import check_rows, row, stacked
+from turbopi.serve.requests import (
+    MAX_BATCH_ROWS,
+    SchedulingOptions,
+    batch_row,
+    check_batch_shapes,
+    read_scheduling,
+    stack_answers,
+)
 from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.serve.scheduling.schedule import Request, Schedule
-from turbopi.serve.scheduling.worker import Ran, Worker
-from turbopi.serve.urgency import MAX_ROWS, Urgency, read_urgency
+from turbopi.serve.worker import Ran, Worker
 from turbopi.support.errors import ConfigError, ObservationError
 
 PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}
@@ -522,14 +528,14 @@ def test_a_fault_of_the_server_on_the_thread_leaves_nobody_waiting() -> None:
 
     async def main() -> None:
         worker = Worker(Schedule(4), run)
-        answers = [worker.ask(Request(0.0, 1.0)) for _ in range(2)]
+        answers = [worker.submit(Request(0.0, 1.0)) for _ in range(2)]
         for answer in answers:
-            (outcome,) = await asyncio.wait_for(answer, 60)
-            assert outcome.wrong == "policy" and "ZeroDivisionError: a fault" in outcome.text
+            (result,) = await asyncio.wait_for(answer, 60)
+            assert result.error == "policy" and "ZeroDivisionError: a fault" in result.text
         worker.stop()
         await worker.drain()
-        (outcome,) = await worker.ask(Request(0.0, 1.0))
-        assert outcome.wrong == "stopping" and not worker.running
+        (result,) = await worker.submit(Request(0.0, 1.0))
+        assert result.error == "stopping" and not worker.running
         worker.close()
 
     asyncio.run(main())
@@ -603,8 +609,8 @@ def test_the_row_that_is_wrong_is_named(rows: int) -> None:
         ({"prompt": ["a", "b"]}, "'prompt' has 2 texts, but turbopi/batch is 3"),
         ({"prompt": ["a", "b", 3]}, r"'prompt' is a list; in a batch it should be an array \[3, …\]"),
         ({"images": {"left": np.zeros((2, 4))}}, r"'images/left' has shape \[2, 4\]"),
-        ({"turbopi/batch": 0}, f"turbopi/batch is 0; it should be a whole number from 1 to {MAX_ROWS}"),
-        ({"turbopi/batch": MAX_ROWS + 1}, "turbopi/batch is 1025"),
+        ({"turbopi/batch": 0}, f"turbopi/batch is 0; it should be a whole number from 1 to {MAX_BATCH_ROWS}"),
+        ({"turbopi/batch": MAX_BATCH_ROWS + 1}, "turbopi/batch is 1025"),
         ({"turbopi/batch": 2.0}, "turbopi/batch is 2.0"),
         ({"turbopi/session": "a"}, "turbopi/batch and turbopi/session were both given"),
         ({"turbopi/model_actions": True}, "turbopi/batch and turbopi/model_actions were both given"),
@@ -671,8 +677,8 @@ def test_the_parts_of_a_message_keep_its_place_and_know_what_comes_later() -> No
 
     async def main() -> None:
         calls = PolicyCalls(FakePolicy(), ServerOptions(), Metrics(), lambda reason: None)
-        outcomes = await calls.ask_rows(make, lambda index: observation(str(index)), 3)
-        assert [outcome.result["prompt"] for outcome in outcomes if outcome.result] == ["0", "1", "2"]
+        results = await calls.submit_batch(make, lambda index: observation(str(index)), 3)
+        assert [result.answer["prompt"] for result in results if result.answer] == ["0", "1", "2"]
         calls.worker.close()
 
     asyncio.run(main())
@@ -750,12 +756,14 @@ def test_a_batch_message_is_recorded_as_the_calls_of_its_rows(tmp_path: Path) ->
 
 def test_rows_and_their_results_are_views_and_stacks() -> None:
     both = {"a": np.arange(4).reshape(2, 2), "in": {"text": ["x", "y"]}, "rate": 5.0, "none": None, "n": np.float32(1)}
-    check_rows(both, 2)
-    second = row(both, 1)
+    check_batch_shapes(both, 2)
+    second = batch_row(both, 1)
     assert second["in"] == {"text": "y"} and second["rate"] == 5.0 and second["none"] is None and second["n"] == 1
     np.testing.assert_array_equal(second["a"], [2, 3])
     assert np.shares_memory(second["a"], both["a"])
-    found = stacked([{"a": np.zeros(2), "b": {"c": np.ones(3)}, "d": np.zeros(n), "e": n, "only": 1} for n in (1, 2)])
+    found = stack_answers(
+        [{"a": np.zeros(2), "b": {"c": np.ones(3)}, "d": np.zeros(n), "e": n, "only": 1} for n in (1, 2)]
+    )
     assert found["a"].shape == (2, 2) and found["b"]["c"].shape == (2, 3) and found["e"] == [1, 2]
     assert isinstance(found["d"], list)
 
@@ -764,23 +772,23 @@ def test_rows_and_their_results_are_views_and_stacks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "urgency"),
+    ("keys", "scheduling"),
     [
-        ({}, Urgency(1.0)),
-        ({"deadline_ms": 80}, Urgency(0.08, True)),
-        ({"deadline_ms": np.float32(0.5)}, Urgency(0.0005, True)),
-        ({"deadline_ms": np.array(60_000)}, Urgency(60.0, True)),
-        ({"control_hz": 50, "left": 20}, Urgency(0.4, True)),
-        ({"left": 20}, Urgency(0.8, True)),  # at the server's 25 Hz
-        ({"control_hz": 1, "left": 100_000}, Urgency(60.0, True)),
-        ({"priority": "simulator"}, Urgency(1.0, priority="simulator")),
-        ({"batch": 3}, Urgency(1.0, priority="simulator", rows=3)),
-        ({"batch": 3, "priority": "robot", "deadline_ms": 50}, Urgency(0.05, True, "robot", 3)),
+        ({}, SchedulingOptions(1.0)),
+        ({"deadline_ms": 80}, SchedulingOptions(0.08, True)),
+        ({"deadline_ms": np.float32(0.5)}, SchedulingOptions(0.0005, True)),
+        ({"deadline_ms": np.array(60_000)}, SchedulingOptions(60.0, True)),
+        ({"control_hz": 50, "left": 20}, SchedulingOptions(0.4, True)),
+        ({"left": 20}, SchedulingOptions(0.8, True)),  # at the server's 25 Hz
+        ({"control_hz": 1, "left": 100_000}, SchedulingOptions(60.0, True)),
+        ({"priority": "simulator"}, SchedulingOptions(1.0, priority="simulator")),
+        ({"batch": 3}, SchedulingOptions(1.0, priority="simulator", batch=3)),
+        ({"batch": 3, "priority": "robot", "deadline_ms": 50}, SchedulingOptions(0.05, True, "robot", 3)),
     ],
 )
-def test_what_a_request_says_of_its_urgency(keys: dict[str, Any], urgency: Urgency) -> None:
+def test_a_requests_scheduling_options_are_read(keys: dict[str, Any], scheduling: SchedulingOptions) -> None:
     received = {"x": 1, **{f"turbopi/{key}": value for key, value in keys.items()}}
-    assert read_urgency(received, 1000.0, 25.0) == urgency
+    assert read_scheduling(received, 1000.0, 25.0) == scheduling
 
 
 @pytest.mark.parametrize(
@@ -810,9 +818,9 @@ def test_what_a_request_says_of_its_urgency(keys: dict[str, Any], urgency: Urgen
         ({"priority": ["robot"]}, "turbopi/priority is .'robot'"),
     ],
 )
-def test_an_urgency_that_cannot_be_meant_is_refused(keys: dict[str, Any], text: str) -> None:
+def test_scheduling_options_that_cannot_be_right_are_refused(keys: dict[str, Any], text: str) -> None:
     with pytest.raises(ObservationError, match=text):
-        read_urgency({"x": 1, **{f"turbopi/{key}": value for key, value in keys.items()}}, 1000.0)
+        read_scheduling({"x": 1, **{f"turbopi/{key}": value for key, value in keys.items()}}, 1000.0)
 
 
 anything = st.one_of(
@@ -839,14 +847,14 @@ anything = st.one_of(
 def test_whatever_the_keys_hold_it_is_meant_or_refused(keys: dict[str, Any], entries: dict[str, Any]) -> None:
     received = {**entries, **{f"turbopi/{key}": value for key, value in keys.items()}}
     try:
-        urgency = read_urgency(received, 1000.0)
-        if urgency.rows is not None:
-            check_rows(entries, urgency.rows)
-            row(entries, urgency.rows - 1)
+        scheduling = read_scheduling(received, 1000.0)
+        if scheduling.batch is not None:
+            check_batch_shapes(entries, scheduling.batch)
+            batch_row(entries, scheduling.batch - 1)
     except ObservationError:
         return
-    assert 0 < urgency.within <= 60 and urgency.priority in ("robot", "simulator")
-    assert urgency.rows is None or 1 <= urgency.rows <= MAX_ROWS
+    assert 0 < scheduling.deadline <= 60 and scheduling.priority in ("robot", "simulator")
+    assert scheduling.batch is None or 1 <= scheduling.batch <= MAX_BATCH_ROWS
 
 
 def test_such_a_refusal_is_a_text_frame_and_the_connection_stays() -> None:

@@ -332,7 +332,7 @@ def test_arrays_of_another_packer_are_named_with_the_one_that_is_spoken(
 
     packed = msgpack.packb({"cameras": [{"wrist": value}]}, default=packer, use_bin_type=bin_type)
     with pytest.raises(
-        WireError, match=r"openpi's arrays, .*__ndarray__.*openpi_client\.msgpack_numpy or turbopi\.wire"
+        WireError, match=r"openpi's arrays, .*__ndarray__.*openpi_client\.msgpack_numpy or turbopi\.realtime\.wire"
     ) as no:
         unpack(packed)
     assert str(no.value).startswith(("'cameras'/0/'wrist': ", "'cameras'/[0]/'wrist': ", "not a msgpack message: "))

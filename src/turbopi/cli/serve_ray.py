@@ -172,7 +172,7 @@ def _serve(
         fleet.check_is_fleet(options.name)
         if options.name in fleet.names():
             _check_orphan(options.name, asked.policy, opened, output)
-        fleet.check_room(options)
+        fleet.check_capacity(options)
         try:
             _deploy(options, asked, checkpoint, output)
             policies = fleet.Fleet.attach(options.name)
@@ -203,12 +203,12 @@ def _update(wishes: FleetWishes, asked: Asked, checkpoint: str | None, output: O
     assert name is not None
     fleet.check_is_fleet(name)
     running = fleet.Fleet.attach(name)
-    before = running.asked()
+    before = running.started_with()
     asked = asked.kept(before, given)
     opened = _open(asked, checkpoint, output)
     check_fits(running.metadata, opened.config.model.action_horizon, robot_of(asked.policy, opened))
     options = scaled_as(wishes.options(asked, checkpoint), before, given)
-    fleet.check_room(options)
+    fleet.check_capacity(options)
     after = asked.plain() | scale_of(options, *fleet.planned(options))
     if ignored := of_the_front(given, after):
         output.line(f"note: {', '.join(ignored)}: of the server in front, which an update leaves as it is", "yellow")
@@ -237,7 +237,9 @@ def _deploy(options: "FleetOptions", asked: Asked, checkpoint: str | None, outpu
     count, use_gpus = fleet.planned(options)
     make = partial(make_policy, asked.policy, _absolute(checkpoint), asked.strict)
     warm = warm_up_of(asked.warmup, asked.server.execution)
-    application = fleet.replicas(make, options, warm=warm, asked=asked.plain() | scale_of(options, count, use_gpus))
+    application = fleet.replicas(
+        make, options, warm=warm, started_with=asked.plain() | scale_of(options, count, use_gpus)
+    )
     output.line(
         f"Fleet {options.name}: {count} replica{'s' * (count > 1)} of {options.checkpoint}, "
         f"{'a GPU each' if use_gpus else 'on CPUs'}; loading and warming up …"

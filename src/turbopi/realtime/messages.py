@@ -1,8 +1,8 @@
 """What a message to a policy server says about real-time execution: optional keys beside the observation's own.
 
-docs/serving_sessions.md has them as a table. Any client of openpi's protocol can send them; a server of another make
-refuses or ignores them, so a client looks for "real_time" in the server's metadata first. The keys about when a request
-wants its answer (SCHEDULING_KEYS) are only named here: serve/urgency.py reads them.
+docs/serving_sessions.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
+ignores them, so a client looks for "real_time" in the server's metadata first. The keys of scheduling (SCHEDULING_KEYS)
+are only named here: serve/requests.py reads them.
 """
 
 from collections.abc import Mapping
@@ -29,13 +29,13 @@ KEYS = (
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a message asks for beside its observation; None and False: it doesn't say.
+class CallOptions:
+    """What a message requests beside its observation; None and False: it doesn't say.
 
-    previous           the running chunk, if the client keeps it itself
-    model_actions      the answer shall have "model_actions", and "anchor" for relative actions
+    previous           the running chunk, if the client stores it itself
+    model_actions      the answer has "model_actions", and "anchor" for relative actions
     mode, delay, execution_horizon
-                       how to join, if the server keeps the running chunk; the latter two in control steps
+                       how to join, if the server stores the running chunk; the latter two in control steps
     guidance           {"schedule": …, "max_guidance_weight": …}, those of them that were given
     session            its name; None: the connection is the session
     step               actions that the robot has carried out in this session when the observation was taken
@@ -65,31 +65,31 @@ def message(
 
     `read_message` is its inverse.
     """
-    asked: dict[str, Any] = {} if seed is None else {"seed": seed}
+    options: dict[str, Any] = {} if seed is None else {"seed": seed}
     if model_actions:
-        asked["model_actions"] = True
+        options["model_actions"] = True
     if previous is not None:
-        asked |= {
+        options |= {
             "previous": np.asarray(previous.left_over, np.float32),
             "delay": int(previous.delay),
             "mode": previous.mode,
         }
         if previous.schedule is not None:
-            asked["schedule"] = previous.schedule
+            options["schedule"] = previous.schedule
         if previous.max_guidance_weight is not None:
-            asked["max_guidance_weight"] = float(previous.max_guidance_weight)
+            options["max_guidance_weight"] = float(previous.max_guidance_weight)
         if previous.execution_horizon is not None:
-            asked["execution_horizon"] = int(previous.execution_horizon)
+            options["execution_horizon"] = int(previous.execution_horizon)
         if previous.anchor is not None:
-            asked["anchor"] = np.asarray(previous.anchor)
-    return {**observation, **{PREFIX + key: value for key, value in asked.items()}}
+            options["anchor"] = np.asarray(previous.anchor)
+    return {**observation, **{PREFIX + key: value for key, value in options.items()}}
 
 
-def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
-    """The observation alone, and what was asked for beside it. Raises ObservationError for what can't be meant."""
+def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptions]:
+    """The observation alone, and the options beside it. Raises ObservationError for values that can't be right."""
     observation = {key: value for key, value in received.items() if not key.startswith(PREFIX)}
     if len(observation) == len(received):
-        return observation, Asked()
+        return observation, CallOptions()
     given = {key.removeprefix(PREFIX): value for key, value in received.items() if key.startswith(PREFIX)}
     unknown = sorted(set(given) - set(KEYS))
     if unknown:
@@ -117,7 +117,7 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
     if left_over is not None:
         assert delay is not None  # else `_left_over` refuses
         previous = RunningChunk(left_over, delay, horizon, cast("JoinMode", mode), anchor, **guidance)
-    asked = Asked(
+    options = CallOptions(
         previous=previous,
         model_actions=_flag(given, "model_actions"),
         mode=cast("JoinMode | None", mode),
@@ -129,11 +129,11 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
         reset=_flag(given, "reset"),
         seed=_whole(given, "seed", 0, MAX_SEED),
     )
-    return observation, asked
+    return observation, options
 
 
 def _left_over(given: Mapping[str, Any]) -> np.ndarray | None:
-    """float32[K, A], the rows of the running chunk that the client keeps; None if it keeps none."""
+    """float32[K, A], the rows of the running chunk that the client stores; None if it stores none."""
     if "previous" not in given:
         if "anchor" in given:
             raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
@@ -213,7 +213,7 @@ def _numbers(given: Mapping[str, Any], key: str, dtype: type[np.floating[Any]] =
     return array
 
 
-def _first(values: np.ndarray, wrong: np.ndarray, key: str) -> str:
-    """The beginning of an error's text: the first value that is `wrong`, and its place."""
-    place = tuple(int(axis) for axis in np.argwhere(wrong)[0])
+def _first(values: np.ndarray, bad: np.ndarray, key: str) -> str:
+    """The beginning of an error's text: the first `bad` value, and its place."""
+    place = tuple(int(axis) for axis in np.argwhere(bad)[0])
     return f"{PREFIX}{key} has {float(values[place]):.3g} at {list(place)}"

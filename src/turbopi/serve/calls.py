@@ -1,4 +1,4 @@
-"""Calls of the policy, and what became of them: whose fault it is when there are no actions."""
+"""Calls of the policy in this process: warm-up, turns on its thread, and whose fault an error is."""
 
 import asyncio
 import itertools
@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol
 
 from turbopi.realtime.chunk import checked_answer
@@ -15,17 +16,17 @@ from turbopi.realtime.queue import of_batch
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import Result
 from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.serve.scheduling.schedule import Request, Schedule
-from turbopi.serve.scheduling.worker import Ran, Worker
+from turbopi.serve.worker import Ran, Worker
 from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError
 
 logger = logging.getLogger(__name__)
 
 AUTO_LARGEST = 8  # observations of a batch, unless the options say
 MEASURED = 3  # runs of each size at warm-up, after one that may compile or capture
-SIZE_SECONDS = 1.0  # that these may take, unless the options ask for batches
+SIZE_SECONDS = 1.0  # that these may take, unless the options set max_batch
 
 
 class Policy(Protocol):
@@ -56,57 +57,6 @@ class _Call:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Calls(Protocol):
-    """Where a server has its requests computed: PolicyCalls, in this process, or the replicas of a fleet."""
-
-    @property
-    def waiting(self) -> int:
-        """Requests that wait for their turn, as far as this process knows."""
-
-    @property
-    def running(self) -> bool: ...
-
-    @property
-    def largest(self) -> int:
-        """Observations of one batch message that aren't split."""
-
-    @property
-    def unwell(self) -> str | None:
-        """Why no request can be computed at the moment, if it is known: `/healthz` says it."""
-
-    def waits(self, session: str) -> bool:
-        """Whether a request of that session waits: a newer one would replace it."""
-
-    async def warm_up(self, **arguments: Any) -> None:
-        """Be ready for requests. `arguments` are those of the policy's `warmup`; raises what it raises."""
-
-    def ask(
-        self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
-    ) -> "asyncio.Future[list[Outcome]]":
-        """One outcome, once the request had its turn: what is wrong if it gets none. May be cancelled.
-
-        arguments  of the policy's `infer`, besides the observation
-        """
-
-    async def ask_rows(
-        self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
-    ) -> list[Outcome]:
-        """An outcome of each of `rows` observations, up to the first few among which one is wrong.
-
-        make  the request for some rows: of their number, and of the number that come later
-        row   the observation of a row, from 0
-        """
-
-    def stop(self) -> None:
-        """Turn away the requests that wait, and all that come; what runs goes on."""
-
-    async def drain(self) -> None:
-        """Wait for what runs. Call `stop` first."""
-
-    def close(self) -> None:
-        """Ask for nothing more, and let go of threads; they aren't waited for long."""
-
-
 class PolicyCalls:
     """Runs a policy in the turns of a schedule, on the thread of `worker`.
 
@@ -123,8 +73,8 @@ class PolicyCalls:
         self._pipelined = bool(getattr(policy, "pipelined", False))
         self._metrics = metrics
         self._on_lost = on_lost
-        self._asked_for, self._execution = options.max_batch, options.execution
-        self._numbers = itertools.count()  # of runs
+        self._max_batch, self._execution = options.max_batch, options.execution
+        self._run_numbers = itertools.count()
         lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
         batch_modes = getattr(policy, "batch_modes", ())
         largest = largest_batch(options, pipelined=self._pipelined, batch_modes=batch_modes, lacking=lacking)
@@ -132,7 +82,7 @@ class PolicyCalls:
         self.joining = BatchTimes(self.times.largest if options.execution is not None else 1)
         turns = BatchTimes() if self._pipelined else None
         schedule = Schedule(options.queue_limit, self.times, turns, self.joining)
-        self.worker = worker = Worker(schedule, self._run)
+        self.worker = worker = Worker(schedule, self._run_turn)
         self.waits, self.stop, self.drain, self.close = worker.schedule.waits, worker.stop, worker.drain, worker.close
 
     @property
@@ -152,7 +102,7 @@ class PolicyCalls:
     async def warm_up(self, **arguments: Any) -> None:
         """Call the policy's `warmup`, if it has one, on the thread, and measure its batches.
 
-        Raises what it raises, and ConfigError if batches were asked for and fail.
+        Raises what it raises, and ConfigError if requested batches fail.
         """
         warmup = getattr(self._policy, "warmup", None)
         if self.times.largest > 1 and getattr(self._policy, "runs_batches", False):
@@ -177,8 +127,8 @@ class PolicyCalls:
         return {"previous": chunk, "model_actions": True}
 
     def _fill(self, times: BatchTimes, make_arguments: Callable[[], dict[str, Any]], what: str) -> None:
-        """Fill a table with runs of the example, with made arguments of `infer`. `what` they are, in messages."""
-        asked_for, arguments = self._asked_for, None
+        """Fill a table with runs of the example. `make_arguments` makes those of `infer`; `what` is for messages."""
+        arguments = None
         for size in _sizes(times):
             try:
                 arguments = make_arguments() if arguments is None else arguments
@@ -186,7 +136,7 @@ class PolicyCalls:
             except DeviceLost:
                 raise
             except Exception as error:  # out of memory, a size that isn't warm, …
-                if asked_for is not None:
+                if self._max_batch is not None:
                     raise ConfigError(
                         f"{what} of {size} fail: {type(error).__name__}: {error}. Choose a smaller --max-batch"
                     ) from error
@@ -199,17 +149,17 @@ class PolicyCalls:
         table = ", ".join(f"{size}: {(times.seconds(size, 0.0) or 0) * 1e3:.1f}" for size in times.sizes)
         if measured > 1:
             logger.info("%s take, by their size, in ms: %s", what, table)
-        if asked_for is not None and times.best(measured, 0.0) == 1 < measured:
+        if self._max_batch is not None and times.best(measured, 0.0) == 1 < measured:
             logger.warning(
                 "--max-batch is %d, but %s of this policy take as long as their observations one by one, so "
                 "none are formed (ms by size: %s)",
-                asked_for,
+                self._max_batch,
                 what,
                 table,
             )
 
     def _measure_size(self, size: int, times: BatchTimes, arguments: Mapping[str, Any]) -> bool:
-        """Measure one size; False if that would take too long, unless the options ask for batches."""
+        """Measure one size; False if that would take too long, unless the options set max_batch."""
         example = self._policy.example_observation()  # type: ignore[attr-defined]
 
         def run() -> float:
@@ -220,11 +170,11 @@ class PolicyCalls:
                 self._infer_batch([example] * size, [arguments] * size)
             return time.perf_counter() - started
 
-        asked_for = self._asked_for is not None
-        if not asked_for and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
+        requested = self._max_batch is not None
+        if not requested and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
             return False
         first = run()
-        if not asked_for and size == 1 and first * MEASURED > SIZE_SECONDS:
+        if not requested and size == 1 and first * MEASURED > SIZE_SECONDS:
             return False
         for _ in range(MEASURED):
             times.measured(size, run())
@@ -232,9 +182,9 @@ class PolicyCalls:
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
-    def ask(
+    def submit(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
-    ) -> "asyncio.Future[list[Outcome]]":
+    ) -> "asyncio.Future[list[Result]]":
         """Run the policy when it is this request's turn.
 
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
@@ -242,125 +192,125 @@ class PolicyCalls:
         request.call = _Call([observation], arguments)
         request.joins = bool(arguments.keys() - {"seed"})
         request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
-        answer = self.worker.ask(request)
+        results = self.worker.submit(request)
         if self._pipelined and not arguments:
-            answer.add_done_callback(self._learn)
-        return answer
+            results.add_done_callback(self._record_seconds)
+        return results
 
     def _may_share(self, arguments: Mapping[str, Any]) -> bool:
         """Whether a request with arguments may run together with others: if warm-up has measured such batches.
 
-        With a seed it runs alone, so that it has the same answer whoever asks meanwhile.
+        With a seed it runs alone, so that other clients' requests can't change its answer.
         """
         chunk = arguments.get("previous")
         measured = self.joining.measured_largest > 1 and (chunk is None or chunk.mode == self._execution)
         return measured and arguments.keys() <= {"previous", "model_actions"}
 
-    async def ask_rows(
+    async def submit_batch(
         self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
-    ) -> list[Outcome]:
-        """An outcome of each of `rows` observations, up to the first part in which one is wrong.
+    ) -> list[Result]:
+        """A result of each of `rows` observations, up to the first part that holds an error.
 
-        They run in parts, each with a turn of its own: others have theirs in between.
+        They run in parts, each with a turn of its own: other requests have theirs in between.
 
-        make  the request for a part, of its number of rows and of those that come later
-        row   the observation of a row; called when its part is asked for
+        make  the request for a part: of its rows, and of the rows that follow in later parts
+        row   the observation of a row; called when its part is submitted
         """
-        outcomes: list[Outcome] = []
-        while len(outcomes) < rows:
+        results: list[Result] = []
+        while len(results) < rows:
             schedule = self.worker.schedule
-            part = schedule.part(rows - len(outcomes), time.perf_counter())
-            request = make(part, rows - len(outcomes) - part)
-            request.continued = bool(outcomes)
-            request.call = _Call([row(len(outcomes) + index) for index in range(part)])
-            outcomes += await self.worker.ask(request)
-            if any(outcome.wrong is not None for outcome in outcomes):
+            part = schedule.part(rows - len(results), time.perf_counter())
+            request = make(part, rows - len(results) - part)
+            request.continued = bool(results)
+            request.call = _Call([row(len(results) + index) for index in range(part)])
+            results += await self.worker.submit(request)
+            if any(result.error is not None for result in results):
                 break
-        return outcomes
+        return results
 
-    def _learn(self, answer: "asyncio.Future[list[Outcome]]") -> None:
-        """How long a pipelined policy takes to its actions; its turns end sooner."""
-        if not answer.cancelled() and (outcome := answer.result()[0]).wrong is None:
-            self.times.ran(1, outcome.seconds, time.perf_counter())
+    def _record_seconds(self, results: "asyncio.Future[list[Result]]") -> None:
+        """Add to T(1) how long a pipelined policy takes to its actions; its turns end sooner."""
+        if not results.cancelled() and (result := results.result()[0]).error is None:
+            self.times.ran(1, result.seconds, time.perf_counter())
 
     # --- on the thread ------------------------------------------------------------------------------------------------
 
-    def _run(self, turn: tuple[Request, ...]) -> Ran:
+    def _run_turn(self, turn: tuple[Request, ...]) -> Ran:
         now = time.perf_counter()
         for request in turn:
             self._metrics.queue_seconds.observe(now - request.queued)
         calls: list[_Call] = [request.call for request in turn]
         if len(calls) == 1:
-            return self._run_one(calls[0])
+            return self._run_call(calls[0])
         observations = [observation for call in calls for observation in call.observations]
         self._metrics.batch_size.observe(len(observations))
-        outcomes = self._together(observations, [call.arguments for call in calls for _ in call.observations])
-        if not outcomes:  # one spoils it: the others don't pay for it, nor does who asks meanwhile
+        results = self._infer_together(observations, [call.arguments for call in calls for _ in call.observations])
+        if not results:  # one observation spoils the batch: each request runs again, in a turn of its own
             return Ran([None] * len(turn))
-        answers, at = [], 0
+        of_calls, at = [], 0
         for call in calls:
-            answers.append(outcomes[at : at + len(call.observations)])
+            of_calls.append(results[at : at + len(call.observations)])
             at += len(call.observations)
-        return Ran(answers, _turn_seconds(outcomes))
+        return Ran(of_calls, _turn_seconds(results))
 
-    def _run_one(self, call: _Call) -> Ran:
+    def _run_call(self, call: _Call) -> Ran:
+        """One request: of one observation, or of the rows of a batch message."""
+        self._metrics.batch_size.observe(len(call.observations))
         if len(call.observations) > 1:
-            self._metrics.batch_size.observe(len(call.observations))
-            if outcomes := self._together(call.observations, [{}] * len(call.observations)):
-                return Ran([outcomes], _turn_seconds(outcomes))
+            if results := self._infer_together(call.observations, [{}] * len(call.observations)):
+                return Ran([results], _turn_seconds(results))
             return Ran([[self._infer(observation, {}) for observation in call.observations]])
-        self._metrics.batch_size.observe(1)
         (observation,) = call.observations
         if self._pipelined and not call.arguments:
             started = time.perf_counter()
-            future = self._submit(observation)
+            future = self._submit_to_policy(observation)
             return Ran([future], time.perf_counter() - started)
-        outcome = self._infer(observation, call.arguments)
-        return Ran([[outcome]], _turn_seconds([outcome]))
+        result = self._infer(observation, call.arguments)
+        return Ran([[result]], None if result.error else result.seconds)
 
-    def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
-        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments), arguments)
+    def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
+        return self._result(time.perf_counter(), partial(self._policy.infer, observation, **arguments), arguments)
 
     def _infer_batch(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
-        """`arguments` of `infer`, for each observation; what isn't asked for by any isn't said."""
-        results = self._policy.infer_batch(list(observations), **of_batch(arguments))  # type: ignore[attr-defined]
-        if not isinstance(results, list) or len(results) != len(observations):
+        """`arguments` of `infer`, for each observation; those that no observation has are left out."""
+        answers = self._policy.infer_batch(list(observations), **of_batch(arguments))  # type: ignore[attr-defined]
+        if not isinstance(answers, list) or len(answers) != len(observations):
             raise TypeError(f"infer_batch must return a list of {len(observations)} results")
-        return results
+        return answers
 
-    def _together(
+    def _infer_together(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
-    ) -> list[Outcome]:
-        """An outcome of each; none if one of them spoiled the batch, so that each shall run for itself."""
+    ) -> list[Result]:
+        """A result of each; none if one of them spoiled the batch, so that each must run on its own."""
         rows, started = len(observations), time.perf_counter()
         try:
-            results = self._infer_batch(observations, arguments)
+            answers = self._infer_batch(observations, arguments)
             seconds = time.perf_counter() - started
-            run = next(self._numbers)
-            each = zip(results, arguments, strict=True)
-            return [_checked(Outcome(seconds, together=rows, run=run), result, one) for result, one in each]
+            run = next(self._run_numbers)
+            each = zip(answers, arguments, strict=True)
+            return [_checked(Result(seconds, batch=rows, run=run), answer, one) for answer, one in each]
         except DeviceLost as error:
             self._on_lost(str(error))
-            return [Outcome(time.perf_counter() - started, wrong="lost", text=str(error))] * rows
+            return [Result(time.perf_counter() - started, error="lost", text=str(error))] * rows
         except (ObservationError, ActionError):
             return []
         except BaseException:
             logger.exception("a batch of %d failed: its observations run one by one", rows)
         finally:
             self._metrics.inference_seconds.observe(time.perf_counter() - started)
-        outcomes = [self._infer(*one) for one in zip(observations, arguments, strict=True)]
-        if all(outcome.wrong != "policy" for outcome in outcomes):  # it was the batch's fault, not one observation's
+        results = [self._infer(*one) for one in zip(observations, arguments, strict=True)]
+        if all(result.error != "policy" for result in results):  # it was the batch's fault, not one observation's
             joins = " that join chunks" if any(arguments) else ""
             pause = (self.joining if joins else self.times).failed(rows, time.perf_counter())
             logger.warning("batches of %d and more%s aren't formed for %g s", rows, joins, pause)
-        return outcomes
+        return results
 
-    def _submit(self, observation: dict[str, object]) -> "Future[list[Outcome]]":
+    def _submit_to_policy(self, observation: dict[str, object]) -> "Future[list[Result]]":
         """Hand the observation to a pipelined policy. The Future never holds an exception."""
         started = time.perf_counter()
-        outcome: Future[list[Outcome]] = Future()
+        results: Future[list[Result]] = Future()
         try:
             answer: Future[dict[str, Any]] = self._policy.submit(observation)  # type: ignore[attr-defined]
         except BaseException as error:
@@ -368,33 +318,33 @@ class PolicyCalls:
             answer.set_exception(error)
 
         def done(ran: "Future[dict[str, Any]]") -> None:
-            outcome.set_result([self._outcome(started, ran.result, {})])
+            results.set_result([self._result(started, ran.result, {})])
 
         answer.add_done_callback(done)
-        return outcome
+        return results
 
-    def _outcome(self, started: float, get: Callable[[], Any], arguments: Mapping[str, Any]) -> Outcome:
-        """What `get`, an `infer` with these arguments, returns or raises.
+    def _result(self, started: float, infer: Callable[[], Any], arguments: Mapping[str, Any]) -> Result:
+        """What `infer`, with these arguments, returns or raises.
 
-        Never raises: an exception couldn't tell whose fault it is.
+        Never raises: an exception couldn't say whose fault it is.
         """
 
         def seconds() -> float:
             return time.perf_counter() - started
 
         try:
-            result = get()
-            return _checked(Outcome(seconds(), run=next(self._numbers)), result, arguments)
+            answer = infer()
+            return _checked(Result(seconds(), run=next(self._run_numbers)), answer, arguments)
         except ObservationError as error:
-            return Outcome(seconds(), wrong="observation", text=str(error))
+            return Result(seconds(), error="observation", text=str(error))
         except ActionError as error:
-            return Outcome(seconds(), wrong="actions", text=str(error))
+            return Result(seconds(), error="actions", text=str(error))
         except DeviceLost as error:
             self._on_lost(str(error))
-            return Outcome(seconds(), wrong="lost", text=str(error))
+            return Result(seconds(), error="lost", text=str(error))
         except BaseException:  # sys.exit() in a policy mustn't end the server either
             logger.exception("the policy failed")
-            return Outcome(seconds(), wrong="policy", text=traceback.format_exc())
+            return Result(seconds(), error="policy", text=traceback.format_exc())
         finally:
             self._metrics.inference_seconds.observe(seconds())
 
@@ -411,33 +361,33 @@ def largest_batch(
     """Observations of a batch, at most, as far as measuring allows. Raises ConfigError.
 
     pipelined, batch_modes  the policy's
-    lacking                 what it would need for batches, and hasn't
+    lacking                 the methods that batches need and it lacks
     """
-    asked_for, execution = options.max_batch, options.execution
+    requested, execution = options.max_batch, options.execution
     if execution is not None and execution not in batch_modes:
-        if asked_for is not None and asked_for > 1:
+        if requested is not None and requested > 1:
             raise ConfigError(
-                f"max_batch={asked_for} was asked for, but this policy runs requests that join a chunk one by one, and "
+                f"max_batch={requested} was asked for, but this policy runs requests that join a chunk one by one, and "
                 f"with execution={execution!r} all do: leave one of them out"
             )
         return 1
     if not pipelined and not lacking:
-        return AUTO_LARGEST if asked_for is None else asked_for
-    if asked_for is not None and asked_for > 1:
+        return AUTO_LARGEST if requested is None else requested
+    if requested is not None and requested > 1:
         why = "is pipelined, and takes one observation at a time" if pipelined else f"has no {' and no '.join(lacking)}"
-        raise ConfigError(f"max_batch={asked_for} was asked for, but this policy {why}: leave it out")
+        raise ConfigError(f"max_batch={requested} was asked for, but this policy {why}: leave it out")
     return 1
 
 
-def _checked(outcome: Outcome, result: Any, arguments: Mapping[str, Any]) -> Outcome:
-    """The outcome with the result of an `infer` with these arguments, if a client may get that."""
+def _checked(result: Result, answer: Any, arguments: Mapping[str, Any]) -> Result:
+    """The result with the answer of an `infer` with these arguments, or with the error if no client may get it."""
     try:
-        return replace(outcome, result=checked_answer(result, model_actions=bool(arguments.get("model_actions"))))
+        return replace(result, answer=checked_answer(answer, model_actions=bool(arguments.get("model_actions"))))
     except ActionError as error:
-        return replace(outcome, wrong="actions", text=str(error))
+        return replace(result, error="actions", text=str(error))
 
 
-def _turn_seconds(outcomes: Sequence[Outcome]) -> float | None:
+def _turn_seconds(results: Sequence[Result]) -> float | None:
     """The seconds of a turn, if all of it was one run with actions."""
-    good = all(outcome.wrong is None and outcome.together == len(outcomes) for outcome in outcomes)
-    return outcomes[0].seconds if good else None
+    one_run = all(result.error is None and result.batch == len(results) for result in results)
+    return results[0].seconds if one_run else None

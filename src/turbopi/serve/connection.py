@@ -1,9 +1,9 @@
 """A websocket connection that costs the server no more than its share, whatever its client does.
 
 The websockets library reads all that comes, as fast as it comes. This connection stands between the socket and the
-library: it looks at the frames' headers alone, hands over what may be handled now, holds the rest (at most one read of
-the socket, 512 KiB) and stops reading. TCP then stops the client. Pictures' messages don't go through the library at
-all: straight.py.
+library: it reads only the frames' headers, hands over what may be handled now, stores the rest (at most one read of
+the socket, 512 KiB) and stops reading. TCP then stops the client. Messages with images bypass the library:
+zero_copy.py.
 """
 
 import asyncio
@@ -22,14 +22,14 @@ from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.zero_copy import SpareBuffer, StraightFrame, apply_mask, goes_straight
+from turbopi.serve.zero_copy import SpareBuffer, ZeroCopyFrame, apply_mask, is_zero_copy
 
-AHEAD = 2  # messages of one client: one that is computed, one that waits
-READ_BYTES = 512 * 1024  # at most, in one read of a socket: two pictures of 224 x 224 are 300 KB
+MAX_UNANSWERED = 2  # messages of one client: one that is computed, one that waits
+READ_BYTES = 512 * 1024  # at most, in one read of a socket: two images of 224 x 224 are 300 KB
 BYTES_OF_ONE_WORK = 65536
-BREATH_SECONDS = 0.002  # between reads of what is thrown away: 128 MB/s and more, so that a client gets to read why
+DISCARD_PAUSE_SECONDS = 0.002  # between reads of discarded bytes: 128 MB/s and more, so that a client gets to read why
 WORK_OF_A_SECOND = 4000.0  # of decoding: 5 * Limits.work_total_rate, so all who are slowed get a fifth of the loop
-WORK_OF_A_REFUSAL = 3.0  # to find out what is wrong, say and log it
+WORK_OF_A_REFUSAL = 3.0  # to find the error, send and log it
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Shared:
     memory: MemoryBudget = field(init=False)
     pool: WorkPool = field(init=False)
     spare: SpareBuffer = field(default_factory=SpareBuffer, init=False)
-    # One for all connections: what one read brought is looked at before the next read.
+    # One for all connections: what one read brought is handled before the next read.
     scratch: memoryview = field(default_factory=lambda: memoryview(bytearray(READ_BYTES)), init=False)
 
     def __post_init__(self) -> None:
@@ -66,11 +66,11 @@ class FrameHead(NamedTuple):
     length: int  # bytes of the payload
     opcode: int
     final: bool
-    straight: bool  # its payload may be received past the library, if it begins a message
+    zero_copy: bool  # its payload may bypass the library, if it begins a message
 
 
 def frame_head(data: bytes | memoryview, at: int) -> FrameHead | None:
-    """The header that begins at `data[at]`; None if its end hasn't come yet. What is wrong in it isn't looked at."""
+    """The header that begins at `data[at]`; None if its end hasn't come yet. Its errors aren't checked here."""
     if len(data) < at + 2:
         return None
     first, second = data[at], data[at + 1]
@@ -80,7 +80,7 @@ def frame_head(data: bytes | memoryview, at: int) -> FrameHead | None:
     if len(data) < at + size:
         return None
     length = int.from_bytes(data[at + 2 : at + 2 + extended], "big") if extended else short
-    return FrameHead(size, length, first & 0x0F, bool(first & 0x80), goes_straight(first, second, length))
+    return FrameHead(size, length, first & 0x0F, bool(first & 0x80), is_zero_copy(first, second, length))
 
 
 @dataclass
@@ -103,11 +103,11 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._owner, self._shared, self._limits = owner, shared, limits
         self._credit = Credit(limits, shared.pool, shared.clock)
         self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on
-        self._held: bytes | memoryview = b""  # received and not handed over
-        self._left = 0  # bytes of the current frame's payload that are still to come
+        self._backlog: bytes | memoryview = b""  # received and not handed over yet
+        self._payload_left = 0  # bytes of the current frame's payload that are still to come
         self._ends_message = False  # the current frame is the last one of a message
         self._message: _Message | None = None  # begun and not complete
-        self._straight: StraightFrame | None = None  # the current frame, if it isn't the library's
+        self._zero_copy: ZeroCopyFrame | None = None  # the current frame, if it isn't the library's
         self._unanswered: deque[_Message] = deque()
         self._handed_over = 0  # bytes of messages
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -132,7 +132,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self._unanswered[0].work += work
 
     def answered(self, how: Literal["good", "bad", "neither"]) -> None:
-        """The oldest message is done with: it got actions, it was wrong, or there were none and it wasn't wrong."""
+        """The oldest message is done with: it got actions, it was bad, or it got none and wasn't bad."""
         if self._unanswered:  # not after the connection was lost
             message = self._unanswered.popleft()
             self._shared.memory.give_back(message.memory)
@@ -154,37 +154,37 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._owner.connected(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self._shared.scratch if self._straight is None else self._straight.room
+        return self._shared.scratch if self._zero_copy is None else self._zero_copy.free
 
     def buffer_updated(self, nbytes: int) -> None:
-        if self._straight is None:
+        if self._zero_copy is None:
             self.data_received(self._shared.scratch[:nbytes])
         else:
-            self._straight.received(nbytes)
-            self._came(nbytes)
-            self._go_on(b"")
+            self._zero_copy.received(nbytes)
+            self._count_payload(nbytes)
+            self._process(b"")
 
     def data_received(self, data: bytes | memoryview) -> None:
-        """Bytes that weren't read into the buffer of `get_buffer`: uvloop, for one, never asks for that."""
+        """Bytes that weren't read into the buffer of `get_buffer`: uvloop, for one, never uses that."""
         if self._head is not None:
             data = self._http(bytes(data))
             if not data:
                 return
-        if self._straight is not None:
-            part = data[: self._left]
-            self._straight.add(part)
-            self._came(len(part))
+        if self._zero_copy is not None:
+            part = data[: self._payload_left]
+            self._zero_copy.add(part)
+            self._count_payload(len(part))
             data = data[len(part) :]
-        self._go_on(data)
+        self._process(data)
 
-    def _go_on(self, data: bytes | memoryview) -> None:
+    def _process(self, data: bytes | memoryview) -> None:
         if self.protocol.state is State.CLOSING:
             self._hand_over(data)  # which throws it away
-            self._breathe()
+            self._pause_reading_briefly()
         else:
-            self._held = bytes(self._held) + data if self._held else data
+            self._backlog = bytes(self._backlog) + data if self._backlog else data
             self._feed()
-            self._held = bytes(self._held)  # the next read of any connection writes over the scratch
+            self._backlog = bytes(self._backlog)  # the next read of any connection writes over the scratch
 
     def eof_received(self) -> None:
         super().eof_received()
@@ -192,7 +192,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._once("write", self._limits.write_seconds, self._never_reads)
+        self._once("write", self._limits.write_seconds, self._abort_unread)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -215,7 +215,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self._shared.memory.give_back(message.memory)
             self._shared.pool.waste(message.work)
         self._unanswered.clear()
-        self._message, self._straight, self._held = None, None, b""
+        self._message, self._zero_copy, self._backlog = None, None, b""
         # This object is part of reference cycles, which may live long: what is large in it must not.
         self.protocol.reader.buffer.clear()
         frames = self.recv_messages.frames
@@ -234,7 +234,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         if end < 0:
             self._head = joined[-3:]
             super().data_received(data)
-            self._breathe()
+            self._pause_reading_briefly()
             return b""
         end += 4 - len(self._head)
         self._head = None
@@ -242,26 +242,26 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         return data[end:]
 
     def _feed(self) -> None:
-        """Hand over what may be handled now, and read on if nothing is held."""
-        if self.protocol.state is not State.OPEN or not self._held:
-            holding = self.protocol.state is State.CONNECTING and bool(self._held)
+        """Hand over what may be handled now, and read on if nothing is left."""
+        if self.protocol.state is not State.OPEN or not self._backlog:
+            blocked = self.protocol.state is State.CONNECTING and bool(self._backlog)
         elif self.paused:
-            holding = True  # it doesn't read what it is sent: what it sends would only lead to more
+            blocked = True  # it doesn't read what it is sent: what it sends would only lead to more
         else:
             self._cancel("retry")
             self._credit.refill()
-            holding = self._scan()
-        self._read_on(not holding)
-        self._watch_progress(holding)
+            blocked = self._scan()
+        self._set_reading(not blocked)
+        self._watch_progress(blocked)
 
     def _scan(self) -> bool:
-        """Hand over as much of what is held as may be handled now. Returns whether the rest must wait.
+        """Hand over as much of the backlog as may be handled now. Returns whether the rest must wait.
 
-        A rest that needn't wait is half a header. The library gets all in one piece, but for frames that go straight.
+        A rest that needn't wait is half a header. The library gets all in one piece, except zero-copy frames.
         """
-        data, at, begun, waits = self._held, 0, 0, False  # the library's next piece begins at `begun`
+        data, at, begun, waits = self._backlog, 0, 0, False  # the library's next piece begins at `begun`
         while at < len(data):
-            if not self._left:
+            if not self._payload_left:
                 head = frame_head(data, at)
                 if head is None:
                     break
@@ -269,41 +269,41 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                 if not self._admit(head):
                     waits = True
                     break
-                self._left = head.length
-                if begins and head.straight and head.length <= self._limits.message_bytes:
+                self._payload_left = head.length
+                if begins and head.zero_copy and head.length <= self._limits.message_bytes:
                     self._hand_over(data[begun:at])
                     begun = at + head.size
                     mask, end = bytes(data[begun - 4 : begun]), begun + head.length
                     if end <= len(data):  # it is here as a whole
-                        self._came(head.length, apply_mask(data[begun:end], mask))
+                        self._count_payload(head.length, apply_mask(data[begun:end], mask))
                         at = begun = end
                         continue
-                    self._straight = StraightFrame(self._shared.spare, head.length, mask)
+                    self._zero_copy = ZeroCopyFrame(self._shared.spare, head.length, mask)
                 at += head.size
-            part = min(self._left, len(data) - at)
-            if self._straight is not None:
-                self._straight.add(data[at : at + part])
+            part = min(self._payload_left, len(data) - at)
+            if self._zero_copy is not None:
+                self._zero_copy.add(data[at : at + part])
                 begun = at + part
             at += part
-            self._came(part)
-        self._held = data[at:]
+            self._count_payload(part)
+        self._backlog = data[at:]
         self._hand_over(data[begun:at])
         return waits
 
-    def _came(self, size: int, message: bytes | None = None) -> None:
-        """So many bytes of the current frame's payload have come. `message`: all of it, past the library."""
-        self._left -= size
+    def _count_payload(self, size: int, message: bytes | None = None) -> None:
+        """Count bytes of the current frame's payload. `message`: all of it, if it bypasses the library."""
+        self._payload_left -= size
         if self._message is None:
             return
         self._handed_over += size
-        if self._left:
+        if self._payload_left:
             return
         if self._ends_message:
             self._unanswered.append(self._message)
             self._message = None
-        if self._straight is not None:
-            message, self._straight = self._straight.message(), None
-        if message is not None and self.protocol.state is State.OPEN:  # not after a wrong frame or a close
+        if self._zero_copy is not None:
+            message, self._zero_copy = self._zero_copy.message(), None
+        if message is not None and self.protocol.state is State.OPEN:  # not after a bad frame or a close
             self.process_event(Frame(Opcode.BINARY, message))
 
     def _hand_over(self, data: bytes | memoryview) -> None:
@@ -321,13 +321,13 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             return True
         message = self._message
         if message is None:
-            if len(self._unanswered) >= AHEAD:
+            if len(self._unanswered) >= MAX_UNANSWERED:
                 return False
             message = _Message()
         size = message.size + head.length
         if size <= self._limits.message_bytes:  # if not, the library refuses it by its header
             needed = max(0, size - self._limits.free_bytes) - message.memory
-            if needed > 0 and not self._take(needed):
+            if needed > 0 and not self._reserve_memory(needed):
                 return False
             message.memory += max(0, needed)
         work = (0.1 if self._message else 1.0) + head.length / BYTES_OF_ONE_WORK
@@ -336,22 +336,22 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._message, self._ends_message = message, head.final
         return True
 
-    def _take(self, size: int) -> bool:
+    def _reserve_memory(self, size: int) -> bool:
         """Take memory for a large message, or be called again when some is free, and give up at last."""
         self._shared.memory.forget(self._feed)
         if self._shared.memory.take(size, self._feed):
             self._cancel("memory")
             return True
         reason = "the server holds too many large messages already: send smaller ones, or try again later"
-        self._once("memory", self._limits.memory_seconds, lambda: self._give_up(CloseCode.TRY_AGAIN_LATER, reason))
+        self._once("memory", self._limits.memory_seconds, lambda: self._fail(CloseCode.TRY_AGAIN_LATER, reason))
         return False
 
-    def _breathe(self) -> None:
+    def _pause_reading_briefly(self) -> None:
         """Read on in a moment: what has no use may come without end until its deadline."""
-        self._read_on(False)
-        self._once("breathe", BREATH_SECONDS, lambda: self._read_on(True))
+        self._set_reading(False)
+        self._once("discard", DISCARD_PAUSE_SECONDS, lambda: self._set_reading(True))
 
-    def _read_on(self, on: bool) -> None:
+    def _set_reading(self, on: bool) -> None:
         if on:
             self.transport.resume_reading()
         else:
@@ -373,10 +373,10 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         if timer := self._timers.pop(name, None):
             timer.cancel()
 
-    def _watch_progress(self, holding: bool) -> None:
+    def _watch_progress(self, blocked: bool) -> None:
         """Half a message or frame must go on, unless it is this server that doesn't read on."""
-        half = bool(self._left or self._message or self._held) and self.protocol.state is State.OPEN
-        if not half or (holding and "retry" not in self._timers):  # who is slowed must still end what it began
+        half = bool(self._payload_left or self._message or self._backlog) and self.protocol.state is State.OPEN
+        if not half or (blocked and "retry" not in self._timers):  # a slowed client must still end what it began
             self._cancel("progress")
         elif "progress" not in self._timers:
             begun = self._handed_over
@@ -386,23 +386,23 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         seconds, rate = self._limits.message_seconds, self._limits.bytes_per_second
         if self._handed_over - before < rate * seconds:
             reason = f"half a message, and less than {rate / 1e3:g} kB/s for {seconds:g} s: send it whole"
-            self._give_up(CloseCode.POLICY_VIOLATION, reason)
+            self._fail(CloseCode.POLICY_VIOLATION, reason)
         else:
-            self._watch_progress(holding=False)
+            self._watch_progress(blocked=False)
 
-    def _never_reads(self) -> None:
-        self._complain(f"took nothing of what it was sent for {self._limits.write_seconds:g} s: the connection is cut")
+    def _abort_unread(self) -> None:
+        self._log_slow(f"took nothing of what it was sent for {self._limits.write_seconds:g} s: the connection is cut")
         self.transport.abort()
 
-    def _give_up(self, code: CloseCode, reason: str) -> None:
+    def _fail(self, code: CloseCode, reason: str) -> None:
         """Close without waiting for anything."""
-        self._complain(f"{reason}: the connection is closed")
+        self._log_slow(f"{reason}: the connection is closed")
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
-        self._held = b""
-        self._read_on(True)  # to see the client leave
+        self._backlog = b""
+        self._set_reading(True)  # to see the client leave
 
-    def _complain(self, text: str) -> None:
+    def _log_slow(self, text: str) -> None:
         self._shared.metrics.error("slow")
         self._shared.log.warning(f"{peer(self)}: {text}", "slow")

@@ -12,7 +12,7 @@ from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 from turbopi.serve.options import check_key
-from turbopi.serve.page.http import asked_for, document, is_feed, is_page, page_key
+from turbopi.serve.page.http import document, is_feed, is_page, page_key, path_of
 
 logger = logging.getLogger(__name__)
 WHAT_TO_SET = (
@@ -25,7 +25,7 @@ class Gate:
     """Decides about each HTTP request on the server's port.
 
     api_key   with it, everything but `/healthz` and the page's document needs `Authorization: Api-Key <api_key>`; load
-              balancers carry no key. The page asks for it, and sends it with the request for its feed
+              balancers carry no key. The page lets its user type it, and sends it with the request for its feed
     hosts     the names by which web pages may address the server; the page and, without a key, `/metrics`, too
     has_page  whether the page and its feed are served
     why_lost  why no request can be served any more (the GPU failed for good), None while all is well: until the
@@ -56,7 +56,7 @@ class Gate:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
         if (refusal := _protocol_refusal(connection, request)) is not None:
             return refusal
-        path, lost = asked_for(request), self._why_lost()
+        path, lost = path_of(request), self._why_lost()
         if len(request.headers.get_all("Host")) > 1:  # which of them a proxy has checked, nobody knows
             return connection.respond(HTTPStatus.BAD_REQUEST, "A request has one Host header.\n")
         if path == "/healthz":

@@ -26,37 +26,37 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
     console = Console() if console is None else console
     server = PolicyServer(policy, options, **given)
 
-    def tell(text: str) -> None:
+    def print_line(text: str) -> None:
         encoding = console.encoding  # of a stdout that may know ASCII alone
         console.print(text.encode(encoding, "backslashreplace").decode(encoding), soft_wrap=True)
 
     if server.host not in LOOPBACK and server.options.api_key is None:
-        tell(
+        print_line(
             f"[yellow]Anyone who can reach {escape(server.host)} can use this policy: an API key protects it "
             "(TURBOPI_API_KEY or --api-key-file).[/]"
         )
     began, warms_up = time.perf_counter(), hasattr(policy, "warmup")
     if warms_up:
-        tell("Warming up …")
+        print_line("Warming up …")
 
     def ready(server: PolicyServer) -> None:
         if warms_up:
-            tell(f"warm-up: {time.perf_counter() - began:.1f} s")
+            print_line(f"warm-up: {time.perf_counter() - began:.1f} s")
         http = escape(server.url.replace("ws://", "http://"))
-        tell(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
+        print_line(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
         if server.options.has_page:
-            tell(f"Page {http}/")
+            print_line(f"Page {http}/")
         if server.joins is not None:
-            tell(escape(server.joins))
+            print_line(escape(server.joins))
         if server.recording is not None:
-            tell(f"Recording to {escape(str(server.recording))}")
-        tell("Ctrl-C stops.")
+            print_line(f"Recording to {escape(str(server.recording))}")
+        print_line("Ctrl-C stops.")
 
     def stopping(server: PolicyServer) -> None:
-        tell("Stopping, after the running inference. Ctrl-C again doesn't wait.")
+        print_line("Stopping, after the running inference. Ctrl-C again doesn't wait.")
 
     server.serve_forever(ready, stopping)
-    tell("Stopped.")
+    print_line("Stopped.")
 
 
 @contextlib.contextmanager

@@ -61,6 +61,6 @@ class LimitedLog:
 
 
 def peer(connection: ServerConnection) -> str:
-    """Address and port of whoever is at the other end, as the log writes them."""
+    """Address and port of the client, as the log writes them."""
     address = connection.remote_address
     return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)

@@ -1,7 +1,7 @@
 """What a client may cost. The numbers are in docs/dev/serving.md; robots never come near them.
 
 Two things are shared by all connections and so need a fair share for each: the event loop's time (`Credit`) and
-memory (`MemoryBudget`). Everything else is a deadline or a count, kept by connection.py and listener.py.
+memory (`MemoryBudget`). Everything else is a deadline or a count, in connection.py and listener.py.
 """
 
 import os
@@ -11,7 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-SPARE_CONNECTIONS = 32  # beyond the clients: health checks, metrics, watchers, who is told that the server is full
+SPARE_CONNECTIONS = (
+    32  # beyond the clients: health checks, metrics, watchers, clients that are refused as the server is full
+)
 SPARE_DESCRIPTORS = 64  # for everything else that the process opens
 
 
@@ -22,7 +24,7 @@ class Limits:
     clients            connected at once; more are refused with HTTP 503
     message_bytes      of one message
     memory_bytes       of all messages that are received, wait or are computed, without the first `free_bytes` of each
-    free_bytes         of a message that it may always hold: robots' pictures don't wait for somebody's large messages
+    free_bytes         of each message that need no share: robots' images don't wait for another client's large messages
     memory_seconds     to wait for a share of that memory
     handshake_seconds  from the connection to the end of its HTTP request
     message_seconds    in which a message that has begun must end, or bring `bytes_per_second` of each
@@ -57,7 +59,7 @@ class Limits:
 
 
 def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -> Limits:
-    """The limits that a server's options ask for; `others`, if given, has the rest."""
+    """The limits of a server's options; `others`, if given, has the rest."""
     size = int(max_message_mb * 2**20)
     limits = Limits(memory_bytes=max(Limits.memory_bytes, 4 * size)) if others is None else others
     return replace(limits, clients=max_clients, message_bytes=size)
@@ -67,7 +69,7 @@ class WorkPool:
     """The rate of work that slowed connections share, and how long new connections wait.
 
     A client that leaves when it is slowed and connects again would never be slowed. So work that led to nothing is
-    counted, and leaks away at `total_rate`. A new connection waits until all is gone; connections that are there
+    counted, and leaks away at `total_rate`. A new connection waits until all has leaked; connections that are there
     already don't.
 
     total_rate  work a second
@@ -229,7 +231,7 @@ def room_for_connections(wanted: int) -> int:
 
 
 def trim_memory() -> None:
-    """Give what the C library keeps for later back to the system, where that can be asked for (glibc)."""
+    """Give memory that the C library has cached back to the system, where it can (glibc)."""
     if os.name != "posix":
         return
     import ctypes

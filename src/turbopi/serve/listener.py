@@ -37,7 +37,7 @@ class Listener:
     """Accepts connections and runs `handle` for each that becomes a websocket. `gate` answers plain HTTP requests.
 
     The loop accepts by itself, not through asyncio's server, which tries again at once, and logs each time, when there
-    are no descriptors left, and which can't be told to wait.
+    are no descriptors left, and which can't wait.
     """
 
     def __init__(self, gate: Gatekeeper, handle: Handler, shared: Shared) -> None:
@@ -143,7 +143,7 @@ class Listener:
             await asyncio.sleep(self._pace.wait())
 
     def _full(self, sock: socket.socket) -> bool:
-        """Whether there is no room for one more: then it is told so. Who came first without a request makes room."""
+        """Whether there is no room for one more: then it gets a 503. The oldest one without a request makes room."""
         if len(self._connected) < self._clients_limit + SPARE_CONNECTIONS:
             return False
         for connection in self._opening:
@@ -164,7 +164,7 @@ class Listener:
         return f"{text}\n"
 
     def _new_connection(self) -> GuardedConnection:
-        # No compression: pictures don't get smaller, only later.
+        # No compression: images don't get smaller, only slower.
         protocol = ServerProtocol(
             max_size=self._shared.limits.message_bytes, select_subprotocol=select_subprotocol, logger=_protocol_logger
         )

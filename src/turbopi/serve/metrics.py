@@ -67,7 +67,7 @@ class Metrics:
         )
         self.delay_steps = Histogram(
             "turbopi_real_time_delay_steps",
-            "Control steps of delay that the policy was told",
+            "Control steps of delay that the policy was given",
             buckets=(0, 1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 50),
             registry=self.registry,
         )
@@ -97,7 +97,7 @@ class Metrics:
             buckets=(1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64),
             registry=self.registry,
         )
-        self._asked = Counter(
+        self._scheduled = Counter(
             "turbopi_scheduled_requests", "Requests for the policy", ["priority"], registry=self.registry
         )
         self._refused = Counter(
@@ -120,17 +120,17 @@ class Metrics:
             registry=self.registry,
         )
         for priority in PRIORITIES:
-            self._asked.labels(priority)
+            self._scheduled.labels(priority)
             self._misses.labels(priority)
             self._slack.labels(priority)
             for kind in REFUSALS:
                 self._refused.labels(kind, priority)
 
-    def asked(self, priority: str, wrong: str | None) -> None:
-        """A request for the policy was dealt with; `wrong` says why it has no actions."""
-        self._asked.labels(priority).inc()
-        if wrong in REFUSALS:
-            self._refused.labels(wrong, priority).inc()
+    def scheduled(self, priority: str, error: str | None) -> None:
+        """A request for the policy has its actions, or an `error`."""
+        self._scheduled.labels(priority).inc()
+        if error in REFUSALS:
+            self._refused.labels(error, priority).inc()
 
     def slack(self, seconds: float, priority: str) -> None:
         """An answer was sent `seconds` before its request's deadline; below 0: after it, a miss."""
@@ -154,12 +154,12 @@ class Metrics:
         self._sessions_dropped.labels(reason).inc()
 
     def watch_sessions(self, count: Callable[[], int]) -> None:
-        """Read the number of sessions from `count` whenever somebody asks."""
+        """Read the number of sessions from `count` at each scrape."""
         sessions = Gauge("turbopi_real_time_sessions", "Sessions with a running chunk", registry=self.registry)
         sessions.set_function(count)
 
     def watch(self, waiting: Callable[[], int], running: Callable[[], bool]) -> None:
-        """Read the queue's state from `waiting` and `running` whenever somebody asks."""
+        """Read the queue's state from `waiting` and `running` at each scrape."""
         depth = Gauge("turbopi_queue_depth", "Requests waiting for the policy", registry=self.registry)
         depth.set_function(waiting)
         busy = Gauge("turbopi_inference_in_progress", "1 while the policy runs", registry=self.registry)

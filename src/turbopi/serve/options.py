@@ -1,4 +1,4 @@
-"""What a server is asked for: said once, for `turbopi serve`, `serve.run`, `serve.running` and PolicyServer."""
+"""A server's options: defined once, for `turbopi serve`, `serve.run`, `serve.running` and PolicyServer."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class ServerOptions:
     max_clients     connected at once; more are refused with HTTP 503
     page            the server's own page and its feed. None: on if only this machine or who has the key can see it
     execution       join each client's chunks here, in a session of each connection: "rtc", "rtc_identity" or
-                    "rtc_trained". None: only for clients that ask for it (docs/serving_sessions.md)
+                    "rtc_trained". None: only for clients that request it (docs/serving_sessions.md)
     control_hz      actions that robots carry out in a second; needed with `execution`
     execution_horizon
                     s, actions of a chunk that robots carry out before the next takes over. None: half of a chunk

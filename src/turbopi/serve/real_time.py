@@ -1,7 +1,7 @@
-"""Real-time execution over the wire: what a request tells of the running chunk, and sessions that remember it here.
+"""Real-time execution over the wire: what a request says about its running chunk, and sessions that store the chunk.
 
-A client may keep the running chunk itself: it asks for "model_actions", and sends what is left of them as
-"turbopi/previous". Or the server keeps it, in a session: then the server must know how many actions the robot has
+A client may store the running chunk itself: it requests "model_actions", and sends the rows that are left as
+"turbopi/previous". Or the server stores it, in a session: then the server must know how many actions the robot has
 carried out since the observation of the chunk before, and how many it will until the new chunk is there.
 docs/serving_sessions.md says from what; what isn't known is refused, never guessed.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from turbopi.realtime import DelayEstimate
-from turbopi.realtime.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
+from turbopi.realtime.messages import KEYS, PREFIX, SCHEDULING_KEYS, CallOptions, read_message
 from turbopi.realtime.queue import default_execution_horizon
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
@@ -29,7 +29,7 @@ IDLE_SECONDS = 300.0  # a named session that got no chunk for so long is dropped
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Chunk:
     """The chunk that a session's robot carries out."""
 
     model_actions: np.ndarray  # float32[H, A]
@@ -40,9 +40,9 @@ class _Kept:
 
 @dataclass
 class _Session:
-    kept: _Kept | None = None
+    chunk: _Chunk | None = None
     used: float = 0.0  # when it got its chunk
-    connection: Hashable = None  # that asked for the chunk; None: it has ended
+    connection: Hashable = None  # that requested the chunk; None: it has ended
     delays: DelayEstimate = field(default_factory=DelayEstimate)
     pending: "list[Plan]" = field(default_factory=list)  # requests that aren't released yet
 
@@ -56,7 +56,7 @@ class Plan:
 
     observation: dict[str, Any]
     arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
-    asked: Asked = field(default_factory=Asked)
+    requested: CallOptions = field(default_factory=CallOptions)
     session: _Session | None = None
     name: str | None = None  # of the session
     received: float = 0.0
@@ -65,10 +65,10 @@ class Plan:
 
 
 class RealTime:
-    """Plans each request for one policy, and keeps the sessions' running chunks. For the event loop's thread alone.
+    """Plans each request for one policy, and stores the sessions' running chunks. For the event loop's thread alone.
 
-    A request alone keeps nothing: a session stays only once it has a chunk. So requests that are refused, however many
-    and of whatever names, end no session of others.
+    A session is stored only once it has a chunk. So refused requests, however many and of any name, end no
+    session of others.
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
@@ -87,12 +87,12 @@ class RealTime:
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
-        # Those with a chunk, the one that got its chunk last at the end, and those with a request alone.
+        # Those with a chunk, the one that got its chunk last at the end, and those with only a request.
         self._named: OrderedDict[str, _Session] = OrderedDict()
         self._of_connections: dict[Hashable, _Session] = {}
         self._horizon: int | None = metadata.get("action_horizon")
         check_execution(options, self._offered, self._horizon)
-        metrics.watch_sessions(lambda: sum(one.kept is not None for one in self._all()))
+        metrics.watch_sessions(lambda: sum(one.chunk is not None for one in self._all()))
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class RealTime:
         }
 
     @property
-    def told(self) -> str | None:
+    def description(self) -> str | None:
         """How this server joins the chunks of clients that don't say how, on one line; None if it doesn't."""
         options, horizon = self._options, self._horizon
         if options.execution is None:
@@ -132,32 +132,32 @@ class RealTime:
         """What to do with a request that has just come. Raises ObservationError."""
         now = self._clock()
         mode = received.get(PREFIX + "mode")
-        unjoined = isinstance(mode, str) and mode == NO_JOINING
-        if unjoined:
+        unconditioned = isinstance(mode, str) and mode == NO_JOINING
+        if unconditioned:
             received = {key: value for key, value in received.items() if key != PREFIX + "mode"}
-        observation, asked = read_message(received)
-        seeded = _seed(asked)
-        if self._joins_nothing(asked, unjoined) and (self._modes or not seeded):
-            return Plan(observation, seeded, name=asked.session)
+        observation, requested = read_message(received)
+        seeded = _seed(requested)
+        if self._joins_nothing(requested, unconditioned) and (self._modes or not seeded):
+            return Plan(observation, seeded, name=requested.session)
         if not self._modes:
             raise ObservationError(
                 f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
                 f"the keys that begin with {PREFIX!r}"
             )
-        mode = asked.mode or self._options.execution
+        mode = requested.mode or self._options.execution
         if mode is not None and mode not in self._modes:
             raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
-        if asked.session is None and (asked.previous is not None or asked.model_actions):
-            if asked.step is not None or asked.reset:
+        if requested.session is None and (requested.previous is not None or requested.model_actions):
+            if requested.step is not None or requested.reset:
                 raise ObservationError(
                     f"{PREFIX}step and {PREFIX}reset are for sessions, but here the client keeps its running chunk"
                 )
-            arguments = {"previous": asked.previous, "model_actions": asked.model_actions, **seeded}
-            about: dict[str, Any] = {"joined": asked.previous is not None}
-            if asked.previous is not None:
-                about |= {"mode": asked.previous.mode, "delay": asked.previous.delay}
-            return Plan(observation, arguments, asked, received=now, about=about)
-        if asked.session is None and self._options.execution is None:
+            arguments = {"previous": requested.previous, "model_actions": requested.model_actions, **seeded}
+            about: dict[str, Any] = {"joined": requested.previous is not None}
+            if requested.previous is not None:
+                about |= {"mode": requested.previous.mode, "delay": requested.previous.delay}
+            return Plan(observation, arguments, requested, received=now, about=about)
+        if requested.session is None and self._options.execution is None:
             raise ObservationError(
                 f"the keys {_named(received)} need a session, as the server keeps no running chunk for this "
                 f"connection: give {PREFIX}session, too, or start the server with --execution"
@@ -167,51 +167,52 @@ class RealTime:
                 f"{PREFIX}session came without {PREFIX}mode; it should be one of {self._modes} "
                 "(or start the server with --execution)"
             )
-        return self._plan_in_session(observation, asked, mode, connection, now)
+        return self._plan_in_session(observation, requested, mode, connection, now)
 
-    def _joins_nothing(self, asked: Asked, unjoined: bool) -> bool:
-        """Whether a request is for the policy alone. `unjoined`: its mode said so. Raises ObservationError."""
-        alone = replace(asked, seed=None) == Asked(session=asked.session)  # nothing but a session was said, if that
-        if unjoined and (asked.session is None or not alone):
+    def _joins_nothing(self, requested: CallOptions, unconditioned: bool) -> bool:
+        """Whether a request needs no chunk. `unconditioned`: its mode is NO_JOINING. Raises ObservationError."""
+        plain = replace(requested, seed=None) == CallOptions(session=requested.session)
+        if unconditioned and (requested.session is None or not plain):
             raise ObservationError(
                 f"{PREFIX}mode {NO_JOINING!r} joins nothing: it needs {PREFIX}session, and goes with no other key of "
                 "real-time execution"
             )
-        if asked.session is None:
-            return alone and self._options.execution is None
-        return unjoined or (alone and not self._modes)
+        if requested.session is None:
+            return plain and self._options.execution is None
+        return unconditioned or (plain and not self._modes)
 
     def _plan_in_session(
-        self, observation: dict[str, Any], asked: Asked, mode: JoinMode, connection: Hashable, now: float
+        self, observation: dict[str, Any], requested: CallOptions, mode: JoinMode, connection: Hashable, now: float
     ) -> Plan:
-        session = self._session(asked, connection, now)
-        kept = None if asked.reset else session.kept
+        session = self._session(requested, connection, now)
+        chunk = None if requested.reset else session.chunk
         previous, about = None, {"joined": False, "mode": mode}
-        if kept is not None:
-            previous, more = self._previous(session, kept, asked, mode, now)
+        if chunk is not None:
+            previous, more = self._previous(session, chunk, requested, mode, now)
             about |= more
-        elif asked.step is None:
+        elif requested.step is None:
             self._need_control_hz()
-        arguments = {"previous": previous, "model_actions": True, **_seed(asked)}
-        plan = Plan(observation, arguments, asked, session, asked.session, now, connection, about)
-        session.kept = kept
+        arguments = {"previous": previous, "model_actions": True, **_seed(requested)}
+        plan = Plan(observation, arguments, requested, session, requested.session, now, connection, about)
+        session.chunk = chunk
         session.pending.append(plan)
-        if asked.session is None:
+        if requested.session is None:
             self._of_connections[connection] = session
         else:
-            self._named.setdefault(asked.session, session)
+            self._named.setdefault(requested.session, session)
         return plan
 
     def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request, of the policy's result."""
-        if "previous" not in plan.arguments:  # nothing was asked of running chunks
+        if "previous" not in plan.arguments:  # nothing was requested of running chunks
             return result
         session, previous = plan.session, plan.arguments["previous"]
         self._metrics.joined(bool(plan.about.get("joined")))
         if session is not None:
             now = self._clock()
             model_actions = np.asarray(result["model_actions"], np.float32)
-            self._keep(_Kept(model_actions, result.get("anchor"), plan.asked.step, plan.received), plan, session, now)
+            chunk = _Chunk(model_actions, result.get("anchor"), plan.requested.step, plan.received)
+            self._store(chunk, plan, session, now)
             if self._options.control_hz is not None:
                 session.delays.add(math.ceil(round((now - plan.received) * self._options.control_hz, 6)))
         if previous is not None:
@@ -219,7 +220,7 @@ class RealTime:
             if "model_actions" in result and previous.delay < len(previous.left_over):
                 new = np.asarray(result["model_actions"])[previous.delay]
                 self._metrics.seam_gap.observe(float(np.abs(new - previous.left_over[previous.delay]).max()))
-        if not plan.asked.model_actions:
+        if not plan.requested.model_actions:
             result = {key: value for key, value in result.items() if key not in ("model_actions", "anchor")}
         return {**result, "real_time": plan.about}
 
@@ -229,13 +230,13 @@ class RealTime:
         if session is None:
             return
         session.pending.remove(plan)
-        if session.kept is None and not session.pending and self._named.get(plan.name or "") is session:
+        if session.chunk is None and not session.pending and self._named.get(plan.name or "") is session:
             del self._named[plan.name or ""]
 
     def closed(self, connection: Hashable) -> None:
         """A connection has ended, and its own session with it."""
         own = self._of_connections.pop(connection, None)
-        if own is not None and own.kept is not None:
+        if own is not None and own.chunk is not None:
             self._metrics.session_dropped("closed")
         for session in self._named.values():
             if session.connection == connection:
@@ -246,26 +247,26 @@ class RealTime:
     def _all(self) -> Iterable[_Session]:
         return (*self._named.values(), *self._of_connections.values())
 
-    def _session(self, asked: Asked, connection: Hashable, now: float) -> _Session:
-        """The session of a request, which may be new: then it isn't kept yet."""
+    def _session(self, requested: CallOptions, connection: Hashable, now: float) -> _Session:
+        """The session of a request, which may be new: then it isn't stored yet."""
         self._drop_idle(now)
-        if asked.session is None:
+        if requested.session is None:
             return self._of_connections.get(connection) or _Session()
-        session = self._named.get(asked.session) or _Session()
-        if session.pending and not self._waits(asked.session):
+        session = self._named.get(requested.session) or _Session()
+        if session.pending and not self._waits(requested.session):
             raise ObservationError(
-                f"session {asked.session!r} has a request that isn't answered yet: give each robot its own session"
+                f"session {requested.session!r} has a request that isn't answered yet: give each robot its own session"
             )
         return session
 
-    def _keep(self, kept: _Kept, plan: Plan, session: _Session, now: float) -> None:
+    def _store(self, chunk: _Chunk, plan: Plan, session: _Session, now: float) -> None:
         """A session has got its chunk. A named one may have to make room for it."""
-        session.kept, session.used, session.connection = kept, now, plan.connection
+        session.chunk, session.used, session.connection = chunk, now, plan.connection
         if plan.name is None:
             return
         self._named[plan.name] = session  # again, if it was dropped meanwhile
         self._named.move_to_end(plan.name)
-        others = [name for name, one in self._named.items() if one.kept is not None and one is not session]
+        others = [name for name, one in self._named.items() if one.chunk is not None and one is not session]
         if len(others) >= MAX_SESSIONS:
             self._drop(self._least_missed(others), "full")
 
@@ -279,7 +280,7 @@ class RealTime:
 
     def _drop_idle(self, now: float) -> None:
         for name, session in tuple(self._named.items()):
-            if session.kept is not None and now - session.used <= IDLE_SECONDS:
+            if session.chunk is not None and now - session.used <= IDLE_SECONDS:
                 return
             if not session.pending:
                 self._drop(name, "idle")
@@ -291,62 +292,62 @@ class RealTime:
     # --- the running chunk --------------------------------------------------------------------------------------------
 
     def _previous(
-        self, session: _Session, kept: _Kept, asked: Asked, mode: JoinMode, now: float
+        self, session: _Session, chunk: _Chunk, requested: CallOptions, mode: JoinMode, now: float
     ) -> tuple[RunningChunk | None, dict[str, Any]]:
         """What is left of a session's chunk (None: nothing), and what the answer says of it.
 
         Raises ObservationError if the request's own delay doesn't fit.
         """
-        horizon = len(kept.model_actions)
-        row, by = self._carried_out(kept, asked, now)
+        horizon = len(chunk.model_actions)
+        row, by = self._carried_out(chunk, requested, now)
         about: dict[str, Any] = {"row": row, "row_by": by}
         if row >= horizon:
             return None, about
-        s = self._execution_horizon(asked, horizon)
+        s = self._execution_horizon(requested, horizon)
         longest = horizon - max(s, row)
         trained = int(self._offered.get("trained_max_delay") or 0)
         fits = min(longest, trained) if mode == "rtc_trained" else longest
-        if asked.delay is not None and asked.delay > fits:
+        if requested.delay is not None and requested.delay > fits:
             why = (
                 f"this checkpoint was trained with delays up to {trained}"
                 if fits < longest
                 else f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}"
             )
             raise ObservationError(
-                f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
+                f"{PREFIX}delay is {requested.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
                 f"(a smaller execution horizon), or lower the control rate"
             )
-        wanted = self._expected_delay(session, asked)
+        wanted = self._expected_delay(session, requested)
         delay = min(wanted, fits)
         about |= {"joined": True, "delay": delay, "execution_horizon": max(s, row), "delay_cut": delay < wanted}
-        left_over = kept.model_actions[row:]
-        guidance = dict(asked.guidance or {})
-        return RunningChunk(left_over, delay, max(s, row), mode, kept.anchor, **guidance), about
+        left_over = chunk.model_actions[row:]
+        guidance = dict(requested.guidance or {})
+        return RunningChunk(left_over, delay, max(s, row), mode, chunk.anchor, **guidance), about
 
-    def _expected_delay(self, session: _Session, asked: Asked) -> int:
+    def _expected_delay(self, session: _Session, requested: CallOptions) -> int:
         """Control steps from the observation to its chunk: what the request says, else the option, else measured."""
-        if asked.delay is not None:
-            return asked.delay
+        if requested.delay is not None:
+            return requested.delay
         if self._options.delay_steps is not None:
             return self._options.delay_steps
         self._need_control_hz()
         return session.delays.steps
 
-    def _carried_out(self, kept: _Kept, asked: Asked, now: float) -> tuple[int, str]:
-        """How many actions the robot has carried out since the kept chunk's observation, and how that is known."""
-        if (asked.step is None) != (kept.step is None):
+    def _carried_out(self, chunk: _Chunk, requested: CallOptions, now: float) -> tuple[int, str]:
+        """How many actions the robot has carried out since the stored chunk's observation, and how that is known."""
+        if (requested.step is None) != (chunk.step is None):
             raise ObservationError(
                 f"{PREFIX}step came in some requests of this session and not in others: send it always or never "
                 f"({PREFIX}reset begins anew)"
             )
-        if asked.step is not None and kept.step is not None:
-            if asked.step < kept.step:
+        if requested.step is not None and chunk.step is not None:
+            if requested.step < chunk.step:
                 raise ObservationError(
-                    f"{PREFIX}step is {asked.step}, after {kept.step} in the request before: it counts the actions "
-                    f"that the robot has carried out in the session. For a new episode send {PREFIX}reset"
+                    f"{PREFIX}step is {requested.step}, after {chunk.step} in the request before: it counts the "
+                    f"actions that the robot has carried out in the session. For a new episode send {PREFIX}reset"
                 )
-            return asked.step - kept.step, "step"
-        return round((now - kept.received) * self._need_control_hz()), "clock"
+            return requested.step - chunk.step, "step"
+        return round((now - chunk.received) * self._need_control_hz()), "clock"
 
     def _need_control_hz(self) -> float:
         if self._options.control_hz is None:
@@ -356,8 +357,8 @@ class RealTime:
             )
         return self._options.control_hz
 
-    def _execution_horizon(self, asked: Asked, horizon: int) -> int:
-        for s in (asked.execution_horizon, self._options.execution_horizon):
+    def _execution_horizon(self, requested: CallOptions, horizon: int) -> int:
+        for s in (requested.execution_horizon, self._options.execution_horizon):
             if s is not None:
                 if s > horizon:
                     raise ObservationError(
@@ -369,7 +370,7 @@ class RealTime:
 
 
 def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon: int | None) -> None:
-    """Raise ConfigError if a policy can't do what the options ask for.
+    """Raise ConfigError if a policy can't do what the options request.
 
     offered  its metadata's "real_time"
     horizon  actions of its chunks; None: it doesn't say
@@ -389,9 +390,9 @@ def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon:
         )
 
 
-def _seed(asked: Asked) -> dict[str, Any]:
+def _seed(requested: CallOptions) -> dict[str, Any]:
     """The argument of `infer`, if the client chose one."""
-    return {} if asked.seed is None else {"seed": asked.seed}
+    return {} if requested.seed is None else {"seed": requested.seed}
 
 
 def _named(received: Mapping[str, Any]) -> str:

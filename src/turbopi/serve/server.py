@@ -1,4 +1,4 @@
-"""The policy server: openpi's websocket protocol around one policy, whose turns schedule.py decides about.
+"""The policy server: openpi's websocket protocol around one policy. requests.py handles each message.
 
     client                          server
       ── GET, Upgrade ────────────▶   /healthz and /metrics are answered as plain HTTP
@@ -22,18 +22,17 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from turbopi.realtime.wire import Unpacker, WireError, pack, unpack
+from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import Recorder
-from turbopi.serve.asking import Asking, Askings
-from turbopi.serve.calls import Calls, Policy, PolicyCalls
+from turbopi.serve.calls import Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
@@ -42,49 +41,26 @@ from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
-from turbopi.serve.outcome import Outcome
 from turbopi.serve.page.http import is_feed
 from turbopi.serve.page.live import Live
 from turbopi.serve.real_time import RealTime
-from turbopi.serve.rows import row
+from turbopi.serve.requests import Calls, ClientLeft, PolicyFailed, Refusal, RequestHandler, batch_row
 from turbopi.serve.signals import stop_signals
-from turbopi.support.errors import ConfigError, DeviceLost, ObservationError
+from turbopi.support.errors import ConfigError, DeviceLost
 
 logger = logging.getLogger(__name__)
 
-_REFUSALS = {
-    "observation": "bad observation: {}",
-    "actions": "bad actions: {}",
-    "lost": "the device is lost: {}",
-    "replica": "the replica is lost: {}",
-}
-LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
+LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers check seldom
 # Seconds after which a thread that computes lets another one go on that waits to. Python's 5 ms are long for answers
 # that wait while the policy's thread reads a batch, and for that thread while the event loop reads what comes.
 SWITCH_SECONDS = 0.0005
-LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
-
-
-class _Refusal(NamedTuple):
-    """Why a request gets no actions: `kind` for the metrics, `text` for the client."""
-
-    kind: str
-    text: str
-
-
-class _ClientGone(Exception):
-    """The client disconnected before its actions were ready."""
-
-
-class _PolicyFailed(Exception):
-    """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
 class PolicyServer:
     """Serves one policy over openpi's websocket protocol. Good for one start.
 
-    options  what it is asked for; `given` are ServerOptions' fields, instead of its own
+    options  `given` are ServerOptions' fields, instead of its own
     limits   what else a client may cost; its `clients` and `message_bytes` are those of the options
     calls    makes what runs the requests, if not the policy in this process, of which then the metadata alone is used;
              called with the metrics, and with what to call with the reason when no request can be run any more
@@ -112,15 +88,22 @@ class PolicyServer:
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
         self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
         self._listener = Listener(self._gate, self._handle, Shared(self._limits, self.metrics, self._log))
-        self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
         self._calls: Calls = (
             PolicyCalls(policy, options, self.metrics, self._lose) if calls is None else calls(self.metrics, self._lose)
         )
         self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._calls.waits)
-        self._askings = Askings(self._calls, self._real_time, options, strict=bool(policy.metadata.get("strict")))
         self._lost: Future[str] = Future()  # set from the worker's thread
+        self._requests = RequestHandler(
+            self._calls,
+            self._real_time,
+            self.metrics,
+            options,
+            self._limits.message_bytes,
+            strict=bool(policy.metadata.get("strict")),
+            why_lost=lambda: self.lost,
+        )
         self.metrics.watch(lambda: self._calls.waiting, lambda: self._calls.running)
         self._live = Live(self.metrics, self._calls, lambda: self.lost) if options.has_page else None
         self._started = False
@@ -153,7 +136,7 @@ class PolicyServer:
     @property
     def joins(self) -> str | None:
         """How it joins the chunks of clients that don't say how, on one line; None if it doesn't."""
-        return self._real_time.told
+        return self._real_time.description
 
     async def start(self) -> None:
         """Take the port, warm the policy up on its thread, start recording, then let clients in.
@@ -200,7 +183,7 @@ class PolicyServer:
         self._calls.stop()
         self._listener.close()
         if self._live is not None:
-            self._live.let_go()
+            self._live.begin_stop()
         goodbyes = [asyncio.create_task(self._say_goodbye(connection)) for connection in tuple(self._idle)]
         await self._calls.drain()
         await self._listener.ended(self._limits.close_seconds)
@@ -208,7 +191,7 @@ class PolicyServer:
         self._calls.close()
         if self._live is not None:
             await self._live.close()
-        self._decoder.shutdown(wait=False)
+        self._requests.close()
         self._log.flush()
         self._gate.flush_log()
         if self._recorder is not None:
@@ -276,20 +259,20 @@ class PolicyServer:
             if is_feed(connection.request):
                 self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
-            self._live.joined(connection)
+            self._live.connected(connection)
         self.metrics.clients.inc()
         self._log.info(f"{peer(connection)} connected", "connections")
         try:
             await connection.send(self._greeting)
             await self._converse(connection)
-        except _ClientGone:
+        except ClientLeft:
             self.metrics.error("disconnected")
             self._log.info(f"{peer(connection)} left during its request", "connections")
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.metrics.error("too_large")
             self._log.info(f"{peer(connection)} disconnected{_said(closed)}", "connections")
-        except _PolicyFailed as failure:
+        except PolicyFailed as failure:
             await self._fail(connection, str(failure))
         except Exception:  # a fault of this server must cost one client, not all
             logger.exception("%s: the server failed", peer(connection))
@@ -299,7 +282,7 @@ class PolicyServer:
             self._real_time.closed(connection)
             self.metrics.clients.dec()
             if self._live is not None:
-                self._live.left(connection)
+                self._live.disconnected(connection)
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
@@ -323,117 +306,62 @@ class PolicyServer:
             self._idle.discard(connection)
             received = time.perf_counter()
             self.metrics.requests.inc()
-            reply = await self._reply(connection, message, received, previous_total)
-            if isinstance(reply, _Refusal):
-                await connection.send(reply.text)
-                await self._refused(connection, reply)
+            reply = await self._requests.handle(connection, message, received)
+            if isinstance(reply, Refusal):
+                await self._refuse(connection, reply)
                 continue
-            result, urgency = reply[0], reply[1].urgency
+            result, scheduling = reply
+            if previous_total is not None:
+                result["server_timing"]["prev_total_ms"] = previous_total * 1e3
             await connection.send(pack(result))
             finished = time.perf_counter()
-            await asyncio.sleep(0)  # those who were in the same batch have their answers before what follows
+            await asyncio.sleep(0)  # the other clients of the batch get their answers before what follows
             self.metrics.request_seconds.observe(finished - received)
-            if urgency.firm:
-                self.metrics.slack(received + urgency.within - finished, urgency.priority)
+            if scheduling.firm:
+                self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
             previous_total = finished - started  # with the wait for the request, as openpi counts it
             if self._live is not None:
                 assert isinstance(message, bytes)
                 self._live.answered(connection, message, result, finished - received)
             if self._recorder is not None:
                 assert isinstance(message, bytes)
-                self._record(message, result, urgency.rows)
-            del message, reply, result  # a connection that waits holds nothing
+                self._record(message, result, scheduling.batch)
+            del message, reply, result  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
 
-    async def _refused(self, connection: GuardedConnection, refusal: _Refusal) -> None:
-        """Close with 1008 if the client has sent nothing but bad requests for long: it doesn't look at the answers."""
-        connection.answered("bad" if refusal.kind in ("malformed", "observation") else "neither")
-        if connection.bad_in_a_row >= self._limits.bad_messages:
-            self.metrics.error("flood")
-            reason = f"{connection.bad_in_a_row} bad requests in a row"
-            self._log.warning(f"{peer(connection)}: {reason}, the last one: {refusal.text}", "flood")
-            await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
-
-    def _record(self, message: bytes, result: dict[str, object], rows: int | None) -> None:
-        """Record a call; of a batch message each row, as a call of its own."""
-        assert self._recorder is not None
-        observation = unpack(message, max_bytes=self._limits.message_bytes)  # the policy may have changed what it got
-        if rows is None:
-            self._recorder.put(observation, result, size=len(message))
-            return
-        for index in range(rows):
-            self._recorder.put(row(observation, index), row(result, index), size=len(message) // rows)
-
-    async def _reply(
-        self, connection: GuardedConnection, message: str | bytes, arrived: float, previous_total: float | None
-    ) -> tuple[dict[str, object], Asking] | _Refusal:
-        """The result to send, or what to tell the client instead. Raises _PolicyFailed and _ClientGone."""
-        if self.lost is not None:
-            return self._refuse(connection, "lost", _REFUSALS["lost"].format(self.lost))
-        try:
-            received = await self._decode(connection, message)
-            asking = self._askings.read(received, connection)
-        except WireError as error:
-            return self._refuse(connection, "malformed", f"bad request: {error}")
-        except ObservationError as error:
-            return self._refuse(connection, "observation", _REFUSALS["observation"].format(error))
-        outcomes = await self._infer(connection, asking, arrived)
-        wrong, priority = self._askings.wrong(asking, outcomes), asking.urgency.priority
-        self.metrics.asked(priority, None if wrong is None else wrong.wrong)
-        if wrong is not None and wrong.wrong is not None:
-            if wrong.wrong == "policy":
-                raise _PolicyFailed(wrong.text)
-            return self._refuse(connection, wrong.wrong, _REFUSALS.get(wrong.wrong, "{}").format(wrong.text))
-        result = self._askings.answer(asking, outcomes)
-        if previous_total is not None:
-            result["server_timing"]["prev_total_ms"] = previous_total * 1e3
-        return result, asking
-
-    def _refuse(self, connection: GuardedConnection, kind: str, text: str) -> _Refusal:
-        self.metrics.error(kind)
+    async def _refuse(self, connection: GuardedConnection, refusal: Refusal) -> None:
+        """Send the refusal; close with 1008 after many bad requests in a row: such a client doesn't read answers."""
+        kind, text = refusal
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+        self.metrics.error(kind)
         self._log.warning(f"{peer(connection)}: {text}", kind)
         if self._live is not None:
             self._live.failed(kind, text)
-        return _Refusal(kind, text)
+        await connection.send(text)
+        connection.answered("bad" if kind in ("malformed", "observation") else "neither")
+        if connection.bad_in_a_row >= self._limits.bad_messages:
+            self.metrics.error("flood")
+            reason = f"{connection.bad_in_a_row} bad requests in a row"
+            self._log.warning(f"{peer(connection)}: {reason}, the last one: {text}", "flood")
+            await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
-    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, object]:
-        """One request as the policy gets it. Raises WireError."""
-        limit, started = self._limits.message_bytes, time.perf_counter()
-        try:
-            if len(message) < LARGE:
-                return _decode(message, limit, connection.unpacker)
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._decoder, _decode, message, limit, Unpacker())
-        finally:
-            connection.took(time.perf_counter() - started)
-
-    async def _infer(self, connection: GuardedConnection, asking: Asking, arrived: float) -> list[Outcome]:
-        """Run the policy when it is this request's turn, unless the client leaves first."""
-        work = self._askings.ask(asking, connection, arrived)
-        gone = connection.connection_lost_waiter
-
-        def leave(_: object) -> None:
-            work.cancel()
-
-        gone.add_done_callback(leave)
-        try:
-            return await work  # without a task of its own, which would cost several turns of the event loop
-        except asyncio.CancelledError:
-            if gone.done():
-                raise _ClientGone from None
-            raise
-        finally:
-            gone.remove_done_callback(leave)
-            self._askings.release(asking)
+    def _record(self, message: bytes, result: dict[str, object], batch: int | None) -> None:
+        """Record a call; of a batch message each row, as a call of its own."""
+        assert self._recorder is not None
+        observation = unpack(message, max_bytes=self._limits.message_bytes)  # the policy may have changed what it got
+        if batch is None:
+            self._recorder.put(observation, result, size=len(message))
+            return
+        for index in range(batch):
+            self._recorder.put(batch_row(observation, index), batch_row(result, index), size=len(message) // batch)
 
 
 def _set_aside_what_stays() -> None:
     """Let the garbage collector leave alone what was made up to here.
 
-    Libraries and the policy are hundreds of thousands of objects: a full collection among requests held all of them up
-    for 160 ms in a fleet's server.
+    Libraries and the policy are hundreds of thousands of objects: a full collection among requests delayed all of them
+    by 160 ms in a fleet's server.
     """
     gc.collect()
     gc.freeze()
@@ -445,15 +373,3 @@ def _said(closed: ConnectionClosed) -> str:
     if frame is None:
         return ""
     return f": {'it' if frame is closed.rcvd else 'the server'} closed with {frame}"
-
-
-def _decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, object]:
-    """One request as the policy gets it. Raises WireError."""
-    if isinstance(message, str):
-        raise WireError("a request is a binary frame with a msgpack map, not a text frame")
-    observation = unpacker.unpack(message, max_bytes=max_bytes)
-    if not isinstance(observation, dict):
-        raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
-    if not all(isinstance(key, str) for key in observation):
-        raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
-    return observation

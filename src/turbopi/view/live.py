@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, W
 from websockets.sync.client import ClientConnection, connect
 
 from turbopi.serve.page.http import FEED
-from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Look, RobotFrame, Trouble, clean
+from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Preview, RobotFrame, Trouble, clean
 from turbopi.support.errors import ConfigError
 from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
 
@@ -81,22 +81,22 @@ class LiveServer:
             except ConnectionClosed:
                 return
             assert isinstance(frame, Frame)
-            yield from (_call(robot, robot.look) for robot in frame.robots if robot.look is not None)
+            yield from (_call(robot, robot.preview) for robot in frame.robots if robot.preview is not None)
             new = [trouble for trouble in frame.troubles if trouble not in told]
             told = set(frame.troubles)
             yield from (ViewedTrouble(one.time, clean(f"{one.error}: {one.text}")) for one in new)
 
 
-def _call(robot: RobotFrame, look: Look) -> ViewedCall:
+def _call(robot: RobotFrame, preview: Preview) -> ViewedCall:
     return ViewedCall(
         robot=robot.address,
-        number=look.number,
-        time=look.time,
-        prompt=look.prompt,
-        actions=np.array(look.actions, np.float64) if look.actions else None,
-        pictures={name: Picture(picture.jpeg, "image/jpeg") for name, picture in look.pictures.items()},
-        numbers={key: np.array(values, np.float64) for key, values in look.numbers.items()},
-        timing={stage: value for stage, value in look.timing.items() if value is not None},
+        number=preview.number,
+        time=preview.time,
+        prompt=preview.prompt,
+        actions=np.array(preview.actions, np.float64) if preview.actions else None,
+        pictures={name: Picture(picture.jpeg, "image/jpeg") for name, picture in preview.images.items()},
+        numbers={key: np.array(values, np.float64) for key, values in preview.numbers.items()},
+        timing={stage: value for stage, value in preview.timing.items() if value is not None},
     )
 
 

@@ -4,12 +4,12 @@
     robot ──────────────────────▶      │                        └───────▶ Replica on another GPU
 
 The server in front is the one of `turbopi serve`, with its whole protocol, limits and metrics; only its requests are
-computed elsewhere (remote_calls.py). It keeps the running chunks of real-time sessions. So a session belongs to the
+computed elsewhere (remote_calls.py). It stores the running chunks of real-time sessions. So a session belongs to the
 server, not to a replica: any replica may answer any request (ray_router.py chooses), and one that dies takes no session
 along. Which processes there are and where, whether they are well, and how they are replaced: that is Ray Serve's part.
 
 A request whose replica died is not tried again on another one: if it was the observation that killed it, one robot
-would kill them all. The client is told, and may ask again.
+would kill them all. The client gets an error, and may send it again.
 
 Ray is imported when a fleet is started. docs/fleet.md is for users.
 """
@@ -40,18 +40,18 @@ logger = logging.getLogger(__name__)
 RAY = SpecifierSet(">=2.60,<3")
 ROUTER = "turbopi.serve.fleet.ray_router.FewestRequests"
 DEPLOYMENT = "policy"  # the replicas' name inside of their application
-HEALTH_PERIOD = 2.0  # seconds between Ray Serve's questions to a replica
+HEALTH_PERIOD = 2.0  # seconds between Ray Serve's health checks of a replica
 DRAIN_SECONDS = 30.0  # that a replica which is replaced may take for the requests that it has
 START_TRIES = 3
 MOST_AT_ONCE = 64  # requests of a replica: the line before its policy refuses earlier
 POLL_SECONDS = 0.5
-REACH_SECONDS = 3.0  # for an answer of one that may have ended
+REACH_SECONDS = 3.0  # for an answer of a replica that may have ended
 STARTED_HERE = {  # of a Ray that is started here
     "RAY_USAGE_STATS_ENABLED": "0",  # it reports to nobody
     "RAY_worker_niceness": "0",  # Ray's own 15 would let every other program on the machine go before the robots
 }
 TOKEN_LOGGER = "ray._private.authentication.authentication_token_setup"
-TOKEN_TOLD = "Token authentication is enabled"  # what begins the three lines that it says at every start
+TOKEN_LINES = "Token authentication is enabled"  # what begins the three lines that it says at every start
 QUIET = {"log_level": "WARNING", "enable_access_log": False}  # a line for each request would cost more than it tells
 OBJECT_STORE_BYTES = 256 * 2**20  # of a Ray that is started here: observations don't go through it
 
@@ -162,7 +162,7 @@ def _silent_about_its_token() -> Iterator[None]:
 
 
 def _isnt_about_its_token(record: logging.LogRecord) -> bool:
-    return not record.getMessage().startswith(TOKEN_TOLD)
+    return not record.getMessage().startswith(TOKEN_LINES)
 
 
 def disconnect() -> None:
@@ -182,7 +182,7 @@ def planned(options: FleetOptions) -> tuple[int, bool]:
     return options.replicas or (max(gpus, 1) if use_gpus else 1), use_gpus
 
 
-def check_room(options: FleetOptions) -> None:
+def check_capacity(options: FleetOptions) -> None:
     """Raise BackendUnavailable if the cluster hasn't the GPUs or CPUs for the fleet: Ray would wait for more machines.
 
     What a running fleet of that name has counts as free: its replicas are replaced one after the other.
@@ -207,7 +207,7 @@ def check_room(options: FleetOptions) -> None:
 
 
 def names() -> list[str]:
-    """The fleets, and whatever else Ray Serve runs on the cluster."""
+    """The fleets, and what else Ray Serve runs on the cluster."""
     _, serve = import_ray()
     return sorted(serve.status().applications)
 
@@ -265,9 +265,9 @@ def replicas(
     options: FleetOptions,
     *,
     warm: Mapping[str, Any] | None,
-    asked: Mapping[str, Any] | None = None,
+    started_with: Mapping[str, Any] | None = None,
 ) -> Any:
-    """The replicas as a Ray Serve application; `make_policy`, `warm` and `asked` are Replica's. Raises ConfigError."""
+    """The replicas as a Ray Serve application; arguments as Replica's. Raises ConfigError."""
     _, serve = import_ray()
     from ray.serve.config import RequestRouterConfig
 
@@ -291,7 +291,7 @@ def replicas(
         )(Replica)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"Ray Serve refuses the fleet's options: {error}") from error
-    return deployment.bind(make_policy, options.checkpoint, warm, options.line, asked=asked)
+    return deployment.bind(make_policy, options.checkpoint, warm, options.line, started_with=started_with)
 
 
 def check_known(autoscaling: Mapping[str, Any]) -> None:
@@ -306,16 +306,16 @@ def check_known(autoscaling: Mapping[str, Any]) -> None:
         )
 
 
-def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
+def deploy(application: Any, name: str, report: Callable[[str], None]) -> None:
     """Start the replicas, or replace those of a fleet of that name one after the other, and wait until all serve.
 
-    `tell` gets what Ray says meanwhile. Raises BackendError if a replica can't start, with the reason.
+    `report` gets what Ray says meanwhile. Raises BackendError if a replica can't start, with the reason.
     """
     _, serve = import_ray()
     serve.start(proxy_location="Disabled", logging_config=QUIET)  # the server in front has the port; once is enough
     target = serve.RunTarget(target=application, name=name, route_prefix=None, logging_config=QUIET)
     serve.run_many([target], wait_for_applications_running=False)
-    told = ""
+    last = ""
     while True:
         state, deployment = status_of(name)
         message = "" if deployment is None else deployment.message or (state.message if state else "")
@@ -323,14 +323,14 @@ def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
             return
         if state is not None and state.status in ("DEPLOY_FAILED", "UNHEALTHY"):
             raise BackendError(f"the replicas of {name!r} can't start: {reason_in(message or state.message)}")
-        if message and message != told:
-            told = message
-            tell(reason_in(message))
+        if message and message != last:
+            last = message
+            report(reason_in(message))
         time.sleep(POLL_SECONDS)
 
 
 def reason_in(message: str) -> str:
-    """What went wrong, of a message of Ray Serve's that holds a traceback: the error's own line."""
+    """The reason in a message of Ray Serve's that holds a traceback: the error's own line."""
     lines = [line.strip() for line in message.strip().splitlines()]
     named = [line for line in lines if line.partition(":")[0].rpartition(".")[2].endswith(("Error", "Unavailable"))]
     return (named or lines or [""])[-1 if named else 0]
@@ -343,8 +343,8 @@ class Fleet:
     """The replicas as a policy for PolicyServer: `PolicyServer(fleet, calls=fleet.calls)`. `attach` makes one."""
 
     def __init__(self, handle: Any, name: str, about: Mapping[str, Any], answer_seconds: float) -> None:
-        # Without references a request goes straight to the replica's gRPC port. By Ray's object store, the default,
-        # a call with two pictures took twice as long: 7.1 instead of 3.4 ms on two CPU cores.
+        # Without references a request goes directly to the replica's gRPC port. By Ray's object store, the default,
+        # a call with two images took twice as long: 7.1 instead of 3.4 ms on two CPU cores.
         self._handle = handle.options(_by_reference=False)
         self._answer_seconds = answer_seconds
         self.metadata: dict[str, Any] = {**about, "fleet": name}
@@ -354,12 +354,13 @@ class Fleet:
         """The fleet of that name, whose replicas run already. Not for an event loop. Raises BackendError."""
         _, serve = import_ray()
         handle = serve.get_deployment_handle(DEPLOYMENT, app_name=name)
-        return cls(handle, name, _told(name, handle.about, answer_seconds), answer_seconds)
+        return cls(handle, name, _call_replica(name, handle.about, answer_seconds), answer_seconds)
 
-    def asked(self) -> dict[str, Any]:
-        """The options that the replicas were started with: empty if they don't know. Raises BackendError."""
-        told: dict[str, Any] = _told(str(self.metadata["fleet"]), self._handle.asked, self._answer_seconds)
-        return told
+    def started_with(self) -> dict[str, Any]:
+        """The options of the replicas' start: empty if they don't know. Raises BackendError."""
+        name = str(self.metadata["fleet"])
+        options: dict[str, Any] = _call_replica(name, self._handle.started_with, self._answer_seconds)
+        return options
 
     def calls(self, metrics: Metrics, on_lost: Callable[[str], None] = lambda reason: None) -> "RemoteCalls":
         watch = Watch(address(), self._answers, partial(why_unwell, self.metadata["fleet"]))
@@ -369,19 +370,19 @@ class Fleet:
         """Whether a replica can be reached."""
         try:
             self._handle.about.remote().result(timeout_s=REACH_SECONDS)
-        except Exception:  # Ray's, gRPC's: whichever it is, that was no answer
+        except Exception:  # Ray's or gRPC's: no answer
             return False
         return True
 
     def infer(self, obs: dict[str, Any], /, **arguments: Any) -> dict[str, Any]:
-        """One request, by whichever replica has the fewest. Raises BackendError if it gives no actions."""
-        outcome = asyncio.run(self.calls(Metrics()).run(obs, arguments, Line()))
-        if outcome.result is None:
-            raise BackendError(f"the fleet {self.metadata['fleet']!r} gave no actions: {outcome.text}")
-        return outcome.result
+        """One request, at the replica that has the fewest. Raises BackendError if it gives no actions."""
+        result = asyncio.run(self.calls(Metrics()).run(obs, arguments, Line()))
+        if result.answer is None:
+            raise BackendError(f"the fleet {self.metadata['fleet']!r} gave no actions: {result.text}")
+        return result.answer
 
 
-def _told(name: str, method: Any, seconds: float) -> Any:
+def _call_replica(name: str, method: Any, seconds: float) -> Any:
     """What a replica answers to a method without arguments."""
     from ray.exceptions import RayError
     from ray.serve.exceptions import RayServeException

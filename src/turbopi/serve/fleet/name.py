@@ -19,29 +19,29 @@ FREED_SECONDS = 5.0  # that Ray may take to see that a server in front has ended
 
 
 class _Front:
-    """An actor that holds a fleet's name for the server in front: Ray ends it with the process that made it."""
+    """An actor that reserves a fleet's name for the server in front: Ray ends it with the process that made it."""
 
-    def __init__(self, whose: str) -> None:
-        self._whose = whose
+    def __init__(self, owner: str) -> None:
+        self._owner = owner
 
-    def whose(self) -> str:
-        return self._whose
+    def owner(self) -> str:
+        return self._owner
 
 
 @contextmanager
 def claimed(name: str) -> Iterator[None]:
     """The fleet's name for this process alone, for this block. Raises ConfigError if a server that lives has it."""
     ray, _ = import_ray()
-    held = ray.remote(num_cpus=0, max_restarts=-1)(_Front).options(name=name, namespace=NAMESPACE)
+    actor = ray.remote(num_cpus=0, max_restarts=-1)(_Front).options(name=name, namespace=NAMESPACE)
     deadline = time.monotonic() + FREED_SECONDS
     while True:
         try:
-            front = held.remote(f"process {os.getpid()} on {socket.gethostname()}")
+            front = actor.remote(f"process {os.getpid()} on {socket.gethostname()}")
             break
         except ValueError as error:  # the name is taken
             if time.monotonic() > deadline:
                 raise ConfigError(
-                    f"a fleet {name!r} runs already{_held_by(name)}: --fleet NAME starts another one, --update "
+                    f"a fleet {name!r} runs already{_owner_of(name)}: --fleet NAME starts another one, --update "
                     f"--fleet {name} replaces its weights"
                 ) from error
             time.sleep(POLL_SECONDS)
@@ -52,11 +52,11 @@ def claimed(name: str) -> Iterator[None]:
             ray.kill(front)
 
 
-def _held_by(name: str) -> str:
-    """Whose a name is, if that can be found out."""
+def _owner_of(name: str) -> str:
+    """The server that has the name, for an error's text; empty if it can't be found out."""
     ray, _ = import_ray()
     try:
-        whose = ray.get(ray.get_actor(name, namespace=NAMESPACE).whose.remote(), timeout=REACH_SECONDS)
+        owner = ray.get(ray.get_actor(name, namespace=NAMESPACE).owner.remote(), timeout=REACH_SECONDS)
     except (ValueError, ray.exceptions.RayError):  # it has just ended, or is being started
         return ""
-    return f" (its server is {whose})"
+    return f" (its server is {owner})"

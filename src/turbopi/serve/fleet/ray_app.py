@@ -41,7 +41,7 @@ Send = Callable[[dict[str, Any]], Awaitable[None]]
 
 PROXY_MB = 16.0  # of a message: what Ray Serve's proxy takes
 AHEAD_BYTES = 64 * 2**20  # that a client may send while its requests wait: Ray's proxy reads all that comes
-PASSED_ON = ("authorization", "origin")  # by these and Host a server on loopback judges whom it lets in (hosts.py)
+PASSED_ON = ("authorization", "origin")  # by these and Host a server on loopback decides who may connect (hosts.py)
 HTTP_SECONDS = 30.0
 CLOSE_SECONDS = 1.0  # for the server to see that a client has left, before the connection is cut
 
@@ -122,8 +122,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     def server(self) -> ServerOptions:
         """Of the server behind Ray's proxy: on loopback, with a port of its own, without a page."""
         if self.max_message_mb > PROXY_MB:
-            asked = f"max_message_mb={self.max_message_mb:g} was asked for"
-            raise ConfigError(f"{asked}, but Ray Serve's proxy takes {PROXY_MB:g} MB")
+            value = f"max_message_mb={self.max_message_mb:g} was asked for"
+            raise ConfigError(f"{value}, but Ray Serve's proxy takes {PROXY_MB:g} MB")
         return ServerOptions(
             port=0,
             api_key=None if self.api_key_file is None else key_in(Path(self.api_key_file)),
@@ -271,7 +271,7 @@ async def _http(port: int, scope: Scope, send: Send) -> None:
         await send({"type": "http.response.body", "body": b""})
         return
 
-    def ask() -> tuple[int, list[tuple[str, str]], bytes]:
+    def get() -> tuple[int, list[tuple[str, str]], bytes]:
         connection = HTTPConnection("127.0.0.1", port, timeout=HTTP_SECONDS)
         try:
             connection.putrequest("GET", _target(scope), skip_host=True, skip_accept_encoding=True)
@@ -283,9 +283,9 @@ async def _http(port: int, scope: Scope, send: Send) -> None:
         finally:
             connection.close()
 
-    status, headers, body = await asyncio.to_thread(ask)
-    kept = [(n.lower().encode("latin-1"), v.encode("latin-1")) for n, v in headers if n.lower() != "connection"]
-    await send({"type": "http.response.start", "status": status, "headers": kept})
+    status, headers, body = await asyncio.to_thread(get)
+    passed = [(n.lower().encode("latin-1"), v.encode("latin-1")) for n, v in headers if n.lower() != "connection"]
+    await send({"type": "http.response.start", "status": status, "headers": passed})
     await send({"type": "http.response.body", "body": body})
 
 

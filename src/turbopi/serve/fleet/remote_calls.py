@@ -12,26 +12,24 @@ from prometheus_client import Histogram
 from turbopi.serve.fleet.replica import Answer, Line
 from turbopi.serve.fleet.watch import Watch
 from turbopi.serve.metrics import BUCKETS, Metrics
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import MAX_BATCH_ROWS, STOPPING, Result
 from turbopi.serve.scheduling.schedule import Request
-from turbopi.serve.scheduling.worker import STOPPING
-from turbopi.serve.urgency import MAX_ROWS
 
 ROUTER_LINE = 256  # requests that may wait for a replica while none is there
 ROWS_AT_ONCE = 8  # observations of one batch message that are at the replicas
 
 
 class RemoteCalls:
-    """Has requests computed by the replicas of `handle`, and keeps their times by replica in `metrics`.
+    """Has requests computed by the replicas of `handle`, and counts their times by replica in `metrics`.
 
     The line is at the replicas: each has its own, with the deadlines and priorities of its requests, and forms its own
     batches. No request of a session replaces another: they may be at different replicas.
 
-    watch             over the cluster, from `warm_up` to `close`; None: nobody looks
+    watch             over the cluster, from `warm_up` to `close`; None: no watch
     on_lost(reason)   is called when Ray has ended; requests that wait are answered then
     """
 
-    largest = MAX_ROWS  # a batch message's observations are requests of their own: there is nothing to split
+    largest = MAX_BATCH_ROWS  # a batch message's observations are requests of their own: there is nothing to split
 
     def __init__(
         self,
@@ -43,7 +41,7 @@ class RemoteCalls:
     ) -> None:
         self._handle, self._metrics, self._answer_seconds = handle, metrics, answer_seconds
         self._watch, self._on_lost = watch, on_lost
-        self._going: set[asyncio.Future[list[Outcome]]] = set()
+        self._running: set[asyncio.Future[list[Result]]] = set()
         self._stopping = False
         self._lost_for: str | None = None  # why no replica can ever answer again
 
@@ -60,7 +58,7 @@ class RemoteCalls:
 
     @property
     def running(self) -> bool:
-        return bool(self._going)
+        return bool(self._running)
 
     @property
     def unwell(self) -> str | None:
@@ -75,33 +73,33 @@ class RemoteCalls:
             loop = asyncio.get_running_loop()
             self._watch.start(lambda reason: loop.call_soon_threadsafe(partial(self._lose, reason)))
 
-    def ask(
+    def submit(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
-    ) -> "asyncio.Future[list[Outcome]]":
-        """Begin it; an outcome of one row. Cancelling it cancels it at the replica, too, unless it runs already."""
+    ) -> "asyncio.Future[list[Result]]":
+        """Begin the request; one result. Cancelling it cancels it at the replica, too, unless it runs already."""
 
-        async def one() -> list[Outcome]:
+        async def one() -> list[Result]:
             return [await self.run(observation, arguments, Line.of(request, time.perf_counter()))]
 
         return self._follow(one())
 
-    async def ask_rows(
+    async def submit_batch(
         self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
-    ) -> list[Outcome]:
-        """An outcome of each row, up to the first few of which one is wrong. Each is a request of its own."""
-        outcomes: list[Outcome] = []
-        while len(outcomes) < rows and all(outcome.wrong is None for outcome in outcomes):
-            few = range(len(outcomes), min(rows, len(outcomes) + ROWS_AT_ONCE))
-            asked = [self.ask(make(1, rows - index - 1), row(index), {}) for index in few]
-            outcomes += [outcome for (outcome,) in await asyncio.gather(*asked)]
-        return outcomes
+    ) -> list[Result]:
+        """A result of each row, up to the first few that hold an error. Each row is a request of its own."""
+        results: list[Result] = []
+        while len(results) < rows and all(result.error is None for result in results):
+            few = range(len(results), min(rows, len(results) + ROWS_AT_ONCE))
+            submitted = [self.submit(make(1, rows - index - 1), row(index), {}) for index in few]
+            results += [result for (result,) in await asyncio.gather(*submitted)]
+        return results
 
     def stop(self) -> None:
         self._stopping = True
 
     async def drain(self) -> None:
-        if self._going:
-            await asyncio.wait(tuple(self._going))
+        if self._running:
+            await asyncio.wait(tuple(self._running))
 
     def close(self) -> None:
         self._stopping = True
@@ -113,64 +111,64 @@ class RemoteCalls:
         self._lost_for = reason
         self._on_lost(reason)
         loop = asyncio.get_running_loop()
-        for work in self._going:  # `run` makes an answer of the cancellation, but only once it has begun: so not yet
+        for work in self._running:  # `run` makes an answer of the cancellation, but only once it has begun: so not yet
             loop.call_soon(work.cancel)
 
-    def _follow(self, work: Coroutine[Any, Any, list[Outcome]]) -> "asyncio.Future[list[Outcome]]":
+    def _follow(self, work: Coroutine[Any, Any, list[Result]]) -> "asyncio.Future[list[Result]]":
         task = asyncio.ensure_future(work)
-        self._going.add(task)
-        task.add_done_callback(self._going.discard)
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
         return task
 
-    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Outcome:
+    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Result:
         """One request. Cancelling it cancels it at the replica, too, unless it runs already."""
         if self._lost_for is not None:
-            return Outcome(0.0, wrong="lost", text=self._lost_for)
+            return Result(0.0, error="lost", text=self._lost_for)
         if self._stopping:
             return STOPPING
         from grpc import RpcError
         from ray.exceptions import RayActorError, RayTaskError
         from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
 
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         response = self._handle.infer.remote(observation, arguments, line)
         try:
             answer: Answer = await asyncio.wait_for(_result(response), self._answer_seconds)
         except asyncio.TimeoutError:
             response.cancel()
-            return self._lost(asked, f"no replica answered within {self._answer_seconds:g} s; ask again")
+            return self._lost(requested, f"no replica answered within {self._answer_seconds:g} s; ask again")
         except asyncio.CancelledError:
             if self._lost_for is not None:
-                return Outcome(time.perf_counter() - asked, wrong="lost", text=self._lost_for)
+                return Result(time.perf_counter() - requested, error="lost", text=self._lost_for)
             response.cancel()
             raise
         except BackPressureError:
-            return Outcome(0.0, wrong="busy", text=f"busy: {ROUTER_LINE} requests wait for a replica; try again")
+            return Result(0.0, error="busy", text=f"busy: {ROUTER_LINE} requests wait for a replica; try again")
         except DeploymentUnavailableError as error:
-            return self._lost(asked, f"there is none: {error.message}")
+            return self._lost(requested, f"there is none: {error.message}")
         except RayTaskError:  # raised by our code there
             raise
         except (RayActorError, RpcError):
-            return self._lost(asked, "its process ended, or can't be reached, during this request; ask again")
-        return self._noted(answer, time.perf_counter() - asked)
+            return self._lost(requested, "its process ended, or can't be reached, during this request; ask again")
+        return self._record(answer, time.perf_counter() - requested)
 
-    def _noted(self, answer: Answer, total: float) -> Outcome:
-        """The outcome, its times in the metrics. `total`: seconds since it was asked for here."""
-        outcome = answer.outcome
-        if outcome.wrong == "stopping":
-            return Outcome(0.0, wrong="busy", text="busy: the replica is being replaced; try again")
-        if outcome.wrong in ("busy", "late", "replaced"):
-            return outcome
+    def _record(self, answer: Answer, total: float) -> Result:
+        """Count its times in the metrics, and return the result. `total`: seconds since it was requested here."""
+        result = answer.result
+        if result.error == "stopping":
+            return Result(0.0, error="busy", text="busy: the replica is being replaced; try again")
+        if result.error in ("busy", "late", "replaced"):
+            return result
         labels = (answer.replica, answer.checkpoint)
-        self._inference.labels(*labels).observe(outcome.seconds)
-        self._waiting.labels(*labels).observe(max(0.0, answer.seconds - outcome.seconds))
-        self._metrics.inference_seconds.observe(outcome.seconds)
-        self._metrics.queue_seconds.observe(max(0.0, total - outcome.seconds))
-        self._metrics.batch_size.observe(outcome.together)
-        return replace(outcome, run=hash((answer.replica, outcome.run)))  # replicas count their runs for themselves
+        self._inference.labels(*labels).observe(result.seconds)
+        self._waiting.labels(*labels).observe(max(0.0, answer.seconds - result.seconds))
+        self._metrics.inference_seconds.observe(result.seconds)
+        self._metrics.queue_seconds.observe(max(0.0, total - result.seconds))
+        self._metrics.batch_size.observe(result.batch)
+        return replace(result, run=hash((answer.replica, result.run)))  # replicas count their runs for themselves
 
-    def _lost(self, asked: float, text: str) -> Outcome:
-        return Outcome(time.perf_counter() - asked, wrong="replica", text=text)
+    def _lost(self, requested: float, text: str) -> Result:
+        return Result(time.perf_counter() - requested, error="replica", text=text)
 
 
 async def _result(response: Any) -> Any:

@@ -17,7 +17,7 @@ from typing import Any
 from turbopi.serve.calls import Policy, PolicyCalls
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import Result
 from turbopi.serve.scheduling.schedule import Priority, Request
 
 logger = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ class Line:
     """What a replica's line goes by, of a `schedule.Request`: its times are counted from its arrival here.
 
     within  seconds to its deadline
-    source  who asks
+    source  the client
     """
 
     within: float = ServerOptions.deadline_ms / 1e3
@@ -50,18 +50,18 @@ class Line:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a replica says of one request.
+    """What a replica answers to one request.
 
     replica     host:pid of its process
     checkpoint  the name of the weights that it runs
     seconds     the request was there, waiting included
-    outcome     what became of it
+    result      of its observation
     """
 
     replica: str
     checkpoint: str
     seconds: float
-    outcome: Outcome
+    result: Result
 
 
 def end_process() -> None:
@@ -76,7 +76,7 @@ class Replica:
     checkpoint   the name of its weights, for people
     warm         arguments of the policy's `warmup`, which ends before the first request; None: no warm-up
     options      of these, what the line and the batches here go by
-    asked        what it was started with, for who replaces it (cli/fleet_update.py)
+    started_with the options of its start, for the command that replaces it (cli/fleet_update.py)
     """
 
     async def __init__(  # type: ignore[misc]  # Ray Serve awaits it
@@ -86,10 +86,10 @@ class Replica:
         warm: Mapping[str, Any] | None,
         options: ServerOptions,
         end: Callable[[], None] = end_process,
-        asked: Mapping[str, Any] | None = None,
+        started_with: Mapping[str, Any] | None = None,
     ) -> None:
         self.name = f"{socket.gethostname()}:{os.getpid()}"
-        self._checkpoint, self._end, self._asked = checkpoint, end, asked
+        self._checkpoint, self._end, self._started_with = checkpoint, end, started_with
         self._loop = asyncio.get_running_loop()
         self._lost: str | None = None
         self._policy = await asyncio.to_thread(make_policy)
@@ -101,9 +101,9 @@ class Replica:
         """The policy's metadata."""
         return self._policy.metadata
 
-    async def asked(self) -> dict[str, Any]:
-        """The options that it was started with; none if nobody said."""
-        return dict(self._asked or {})
+    async def started_with(self) -> dict[str, Any]:
+        """The options of its start; empty if they aren't known."""
+        return dict(self._started_with or {})
 
     async def infer(
         self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line | None = None
@@ -111,11 +111,11 @@ class Replica:
         """One request; `arguments` are those of the policy's `infer` besides the observation."""
         began = time.perf_counter()
         request = (line or Line()).request(began)
-        (outcome,) = await self._calls.ask(request, observation, arguments)
-        return Answer(self.name, self._checkpoint, time.perf_counter() - began, outcome)
+        (result,) = await self._calls.submit(request, observation, arguments)
+        return Answer(self.name, self._checkpoint, time.perf_counter() - began, result)
 
     def check_health(self) -> None:
-        """Ray Serve asks now and then, and replaces the replica when this raises."""
+        """Ray Serve calls this now and then, and replaces the replica when this raises."""
         if self._lost is not None:
             raise RuntimeError(f"the device is lost: {self._lost}")
 

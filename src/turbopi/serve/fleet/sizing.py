@@ -1,12 +1,12 @@
 """How many GPUs a fleet of robots needs: arithmetic alone, from the times T(B) of a GPU.
 
-Each robot asks for a chunk of H actions every s control steps, and has it d steps later: d ≤ s, or it would ask before
-it has its answer, and d ≤ H - s, or it would run out of actions. With s = H it does run out, and stands still for d.
-The server gives all the same time, so that the earliest deadline is who asked first, and forms batches as
-`BatchTimes.best` says.
+Each robot requests a chunk of H actions every s control steps, and has it d steps later: d ≤ s, or its next request
+would come before its answer, and d ≤ H - s, or it would run out of actions. With s = H it does run out, and stands
+still for d. The server gives all the same time, so that the earliest deadline is the oldest request, and forms batches
+as `BatchTimes.best` says.
 
-The longest that one of n robots waits on a GPU. When it asks, others wait or run, each with one request, since d ≤ s.
-If a turn runs, at most n - 1 of them wait, itself among them; the first m of those that wait are done after
+The longest that one of n robots waits on a GPU. When its request comes, others wait or run, each with one request,
+since d ≤ s. If a turn runs, at most n - 1 of them wait, itself among them; the first m of these are done after
 
     W(m) = max over r of T(k(r)) + W(m - k(r)),    r = m … n that may wait, k(r) of which run together
 
@@ -70,7 +70,7 @@ class Fleet:
 
     @property
     def allowed_steps(self) -> int:
-        """Those that were asked for, else as many as s and H allow."""
+        """Those that were requested, else as many as s and H allow."""
         return self.most_delay if self.delay_steps is None else self.delay_steps
 
     def overhead(self, gpus: int) -> float:
@@ -111,7 +111,7 @@ class Plan:
 def plan_fleet(
     fleet: Fleet, seconds: Mapping[int, float], max_batch: int | None = None, gpus: int | None = None
 ) -> Plan:
-    """The fewest GPUs that keep every robot's delay.
+    """The fewest GPUs that meet every robot's delay.
 
     seconds    T(B) by B; 1 is among them
     max_batch  no larger batches; None: none larger than the largest of `seconds`

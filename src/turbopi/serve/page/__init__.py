@@ -2,12 +2,12 @@
 
     http.py      the document's response: security headers; where the feed is; the key that a browser sends
     messages.py  what the feed says, as types: each message is JSON
-    look.py      one answered call as people look at it: thumbnails, the chunk, the state
+    preview.py   one answered call, for people: thumbnails, the chunk, the state
     live.py      what the server has seen of its robots, and the watchers, to whom it sends that
     device.py    memory of the device
     page.html    the document: style and script are in it, and it loads nothing from elsewhere
 
-Nothing here may slow a robot's answer. A call is looked at after its answer was sent, on a thread beside the event
-loop, at most LOOKS_A_SECOND of all robots, and only while somebody watches. A watcher that reads slowly gets fewer
-messages: none waits for it.
+Nothing here may slow a robot's answer. A call's preview is made after its answer was sent, on a thread beside the event
+loop, at most PREVIEWS_A_SECOND of all robots, and only while a page is open. A watcher that reads slowly gets fewer
+messages: no client waits for it.
 """

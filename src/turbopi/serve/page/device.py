@@ -11,7 +11,7 @@ from turbopi.serve.page.messages import Memory
 def memory_of(device: str) -> Callable[[], Memory]:
     """What tells the memory in use: of a GPU what PyTorch holds, else what this process does.
 
-    `device` is the policy's: "cuda:0", "cpu". PyTorch's own count is asked, never the driver, which calls wait for.
+    `device` is the policy's: "cuda:0", "cpu". It is PyTorch's own count: the driver's would delay calls.
     """
     if device.startswith("cuda"):
         import torch

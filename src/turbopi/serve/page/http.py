@@ -1,4 +1,4 @@
-"""The page's HTTP side: its document with the headers that keep it alone, and how a browser brings the API key."""
+"""The page's HTTP side: its document with the headers that isolate it, and how a browser brings the API key."""
 
 import base64
 import binascii
@@ -18,19 +18,19 @@ _KEY = "key."  # before the API key, as another subprotocol: a page can't set he
 _NO_KEY, _NEEDS_KEY = 'data-key="no"', 'data-key="needed"'
 
 
-def asked_for(request: Request) -> str:
+def path_of(request: Request) -> str:
     """The request's path, without what follows a question mark."""
     return request.path.partition("?")[0]
 
 
 def is_feed(request: Request | None) -> bool:
-    """Whether it asks for the feed."""
-    return request is not None and asked_for(request) == FEED
+    """Whether it requests the feed."""
+    return request is not None and path_of(request) == FEED
 
 
 def is_page(request: Request) -> bool:
-    """Whether it asks for the document: a robot that connects to the same path wants to become a websocket."""
-    return asked_for(request) == PAGE and not request.headers.get_all("Upgrade")
+    """Whether it requests the document: a robot that connects to the same path wants to become a websocket."""
+    return path_of(request) == PAGE and not request.headers.get_all("Upgrade")
 
 
 def page_key(request: Request) -> str | None:

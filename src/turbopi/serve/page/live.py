@@ -27,25 +27,25 @@ from turbopi.serve.page.messages import (
     FEED_VERSION,
     Frame,
     Hello,
-    Look,
     Memory,
+    Preview,
     RobotFrame,
     StageTimes,
     Trouble,
     clean,
 )
-from turbopi.serve.page.preview import look_at
+from turbopi.serve.page.preview import make_preview
 from turbopi.support.action_groups import action_groups
 from turbopi.version import turbopi_version
 
 logger = logging.getLogger(__name__)
 
 FRAMES_A_SECOND = 4.0  # to each watcher
-LOOKS_A_SECOND = 16.0  # of all robots together
-MESSAGE_BYTES = 16 * 2**20  # of an observation: a longer one isn't kept until it is looked at
-LOOKING = 4  # calls that are looked at or wait for it: others aren't shown
+PREVIEWS_A_SECOND = 16.0  # of all robots together
+MESSAGE_BYTES = 16 * 2**20  # of an observation: a longer one isn't stored for its preview
+MAX_PENDING = 4  # previews that are being made or wait: other calls aren't shown
 ROBOTS = 16  # shown, of those that are connected
-CALLS = 512  # whose times are kept
+CALLS = 512  # whose times are stored
 TROUBLES = 20
 BINS = 60
 STAGES = ("preprocess", "queue", "vision", "prefix", "denoise", "infer", "postprocess", "total", "request")
@@ -55,16 +55,16 @@ Timing = Mapping[str, float]
 
 @dataclass
 class _Robot:
-    """A connected client, as long as it is one."""
+    """A connected client."""
 
     id: int
     address: str
     connected: float
     calls: int = 0
     last: float | None = None
-    look: Look | None = None
-    looked: float = -np.inf  # the event loop's time
-    looking: bool = False
+    preview: Preview | None = None
+    previewed: float = -np.inf  # the event loop's time
+    pending: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Live:
         self._timings: deque[Timing] = deque(maxlen=CALLS)
         self._troubles: deque[Trouble] = deque(maxlen=TROUBLES)
         self._watchers = 0
-        self._looks: set[asyncio.Task[None]] = set()
+        self._pending: set[asyncio.Task[None]] = set()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="turbopi-page")
         self._closed = asyncio.Event()
         self._hello = ""
@@ -124,70 +124,72 @@ class Live:
         )
         self._hello = _json(hello)
 
-    def let_go(self) -> None:
-        """The server stops: say so to the watchers, and look at nothing more."""
+    def begin_stop(self) -> None:
+        """The server stops: end the watchers' feed, and make no more previews."""
         self._closed.set()
 
     async def close(self) -> None:
         """End the thread. No watcher may be left."""
-        await asyncio.gather(*self._looks)
+        await asyncio.gather(*self._pending)
         self._thread.shutdown(wait=False)
 
-    # --- what robots do -----------------------------------------------------------------------------------------------
+    # --- robots -------------------------------------------------------------------------------------------------------
 
-    def joined(self, connection: GuardedConnection) -> None:
+    def connected(self, connection: GuardedConnection) -> None:
         self._known += 1
         self._robots[connection] = _Robot(self._known, peer(connection), time.time())
 
-    def left(self, connection: GuardedConnection) -> None:
+    def disconnected(self, connection: GuardedConnection) -> None:
         self._robots.pop(connection, None)
 
     def answered(
         self, connection: GuardedConnection, message: bytes, reply: Mapping[str, object], seconds: float
     ) -> None:
-        """`reply` was sent, `seconds` after `message` had come. Nobody may change them any more."""
+        """`reply` was sent, `seconds` after `message` had come. They must not change any more."""
         robot = self._robots[connection]
         robot.calls += 1
         robot.last = time.time()
         timing = _timing(reply, seconds)
         self._timings.append(timing)
-        if not self._watchers or robot.looking or len(self._looks) >= LOOKING or self._closed.is_set():
+        if not self._watchers or robot.pending or len(self._pending) >= MAX_PENDING or self._closed.is_set():
             return
         now = asyncio.get_running_loop().time()
-        if now - robot.looked >= max(1 / FRAMES_A_SECOND, len(self._robots) / LOOKS_A_SECOND):
-            robot.looked, robot.looking = now, True
-            kept = message if len(message) <= MESSAGE_BYTES else None
-            task = asyncio.ensure_future(self._look(robot, kept, reply, timing))
-            self._looks.add(task)
-            task.add_done_callback(self._looks.discard)
+        if now - robot.previewed >= max(1 / FRAMES_A_SECOND, len(self._robots) / PREVIEWS_A_SECOND):
+            robot.previewed, robot.pending = now, True
+            shown = message if len(message) <= MESSAGE_BYTES else None
+            task = asyncio.ensure_future(self._make_preview(robot, shown, reply, timing))
+            self._pending.add(task)
+            task.add_done_callback(self._pending.discard)
 
     def failed(self, kind: str, text: str) -> None:
-        """A request got no actions: `text` is what the client was told."""
+        """A request got no actions: `text` is what the client was sent."""
         self._troubles.append(Trouble(time.time(), kind, clean(text)))
 
-    async def _look(self, robot: _Robot, message: bytes | None, reply: Mapping[str, object], timing: Timing) -> None:
+    async def _make_preview(
+        self, robot: _Robot, message: bytes | None, reply: Mapping[str, object], timing: Timing
+    ) -> None:
         loop, number, last = asyncio.get_running_loop(), robot.calls, robot.last
         assert last is not None
         try:
-            robot.look = await loop.run_in_executor(self._thread, look_at, number, last, message, reply, timing)
+            robot.preview = await loop.run_in_executor(self._thread, make_preview, number, last, message, reply, timing)
         except Exception:  # a fault of the page must not cost a robot anything
             if not self._faulty:  # once: it may come with every call
                 logger.exception("the page can't show a call")
             self._faulty = True
         finally:
-            robot.looking = False
+            robot.pending = False
 
-    # --- those who watch ----------------------------------------------------------------------------------------------
+    # --- watchers -----------------------------------------------------------------------------------------------------
 
     async def watch(self, connection: GuardedConnection) -> None:
         """Send the feed to one watcher until it leaves or the server stops. It has nothing to say itself."""
         says, closed = asyncio.ensure_future(connection.recv()), asyncio.ensure_future(self._closed.wait())
-        had: dict[int, int] = {}  # robot -> number of the last look that was sent
+        sent: dict[int, int] = {}  # robot -> number of the last preview that was sent
         self._watchers += 1
         try:
             await connection.send(self._hello)
             while not (says.done() or closed.done()):
-                await connection.send(await self._frame(had))  # who reads slowly is sent fewer
+                await connection.send(await self._frame(sent))  # a slow reader is sent fewer
                 await asyncio.wait({says, closed}, timeout=1 / FRAMES_A_SECOND, return_when=asyncio.FIRST_COMPLETED)
             if says.done():
                 says.result()
@@ -204,14 +206,14 @@ class Live:
                 with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                     await wait
 
-    async def _frame(self, had: dict[int, int]) -> str:
-        moment = self._moment(had)
-        had.update({robot.id: robot.look.number for robot in moment.robots if robot.look is not None})
-        for gone in had.keys() - {robot.id for robot in moment.robots}:
-            del had[gone]
+    async def _frame(self, sent: dict[int, int]) -> str:
+        moment = self._moment(sent)
+        sent.update({robot.id: robot.preview.number for robot in moment.robots if robot.preview is not None})
+        for robot_id in sent.keys() - {robot.id for robot in moment.robots}:
+            del sent[robot_id]
         return await asyncio.get_running_loop().run_in_executor(self._thread, _frame_of, moment, self._memory)
 
-    def _moment(self, had: Mapping[int, int]) -> _Moment:
+    def _moment(self, sent: Mapping[int, int]) -> _Moment:
         latest = sorted(self._robots.values(), key=lambda robot: robot.last or robot.connected)[-ROBOTS:]
         return _Moment(
             time=time.time(),
@@ -223,20 +225,20 @@ class Live:
             errors=self._metrics.errors_so_far(),
             troubles=tuple(self._troubles),
             timings=tuple(self._timings),
-            robots=[_robot_frame(robot, had) for robot in sorted(latest, key=lambda robot: robot.id)],
+            robots=[_robot_frame(robot, sent) for robot in sorted(latest, key=lambda robot: robot.id)],
         )
 
 
-def _robot_frame(robot: _Robot, had: Mapping[int, int]) -> RobotFrame:
-    new = robot.look if robot.look is not None and robot.look.number != had.get(robot.id) else None
+def _robot_frame(robot: _Robot, sent: Mapping[int, int]) -> RobotFrame:
+    new = robot.preview if robot.preview is not None and robot.preview.number != sent.get(robot.id) else None
     return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new)
 
 
 def _timing(reply: Mapping[str, object], seconds: float) -> Timing:
-    """{stage: milliseconds} of STAGES, as far as the policy tells them."""
-    told = reply.get("policy_timing")
-    told = told if isinstance(told, Mapping) else {}
-    found = {stage: told.get(f"{stage}_ms") for stage in STAGES}
+    """{stage: milliseconds} of STAGES, as far as the policy reports them."""
+    given = reply.get("policy_timing")
+    given = given if isinstance(given, Mapping) else {}
+    found = {stage: given.get(f"{stage}_ms") for stage in STAGES}
     numbers = {stage: float(value) for stage, value in found.items() if isinstance(value, int | float)}
     return numbers | {"request": seconds * 1e3}
 
@@ -262,7 +264,7 @@ def _frame_of(moment: _Moment, memory: Callable[[], Memory]) -> str:
 
 
 def stage_times(timings: Sequence[Timing]) -> tuple[float, list[StageTimes]]:
-    """Width of a bin in milliseconds, and the times of each stage that was told: all stages share the bins.
+    """Width of a bin in milliseconds, and the times of each stage that was reported: all stages share the bins.
 
     They reach somewhat beyond the longest stage's 99th percentile, so that one slow call doesn't squeeze all others.
     """

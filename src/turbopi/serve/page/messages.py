@@ -6,7 +6,7 @@ as text, never as markup.
 
 from typing import Any
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from turbopi.support.action_groups import ActionGroup
 
@@ -30,14 +30,14 @@ class Hello(Struct, frozen=True, tag="hello", tag_field="kind"):
 
 class Thumbnail(Struct, frozen=True):
     jpeg: bytes
-    width: int  # of the picture that the robot sent
+    width: int  # of the image that the robot sent
     height: int
 
 
-class Look(Struct, frozen=True):
+class Preview(Struct, frozen=True):
     """One answered call.
 
-    number   of the robot's calls, from 1. Some are left out: a robot may ask more often than the feed tells
+    number   of the robot's calls, from 1. Some are left out: a robot may call more often than the feed shows
     time     when its answer had been sent, in seconds since 1970
     actions  [H, d] in the robot's units; empty if they are too many to show
     numbers  the observation's arrays of few numbers, such as its state
@@ -50,20 +50,20 @@ class Look(Struct, frozen=True):
     prompt: str
     actions: list[list[float | None]]
     numbers: dict[str, list[float | None]]
-    pictures: dict[str, Thumbnail]
+    images: dict[str, Thumbnail] = field(name="pictures")
     timing: dict[str, float | None]
     note: str = ""
 
 
 class RobotFrame(Struct, frozen=True):
-    """A connected robot. `look` is its last look if this watcher hasn't had it yet."""
+    """A connected robot. `preview` is its last call if this watcher hasn't had it yet."""
 
     id: int
     address: str
     connected: float  # seconds since 1970, as `last`
     calls: int
     last: float | None
-    look: Look | None = None
+    preview: Preview | None = field(default=None, name="look")
 
 
 class StageTimes(Struct, frozen=True):
@@ -108,7 +108,7 @@ class Frame(Struct, frozen=True, tag="frame", tag_field="kind"):
     troubles: list[Trouble]  # the last ones
     latency_bin_ms: float
     latency: list[StageTimes]
-    robots: list[RobotFrame]  # those that asked last, in the order in which they came
+    robots: list[RobotFrame]  # those with the last requests, in the order in which they connected
 
 
 def clean(text: str, limit: int = 300) -> str:

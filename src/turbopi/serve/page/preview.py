@@ -1,4 +1,4 @@
-"""One answered call as people look at it."""
+"""A preview of one answered call, for people."""
 
 import io
 from collections.abc import Mapping
@@ -7,31 +7,31 @@ import numpy as np
 from PIL import Image
 
 from turbopi.realtime.wire import unpack
-from turbopi.serve.page.messages import Look, Thumbnail, clean
+from turbopi.serve.page.messages import Preview, Thumbnail, clean
 from turbopi.support.action_groups import pictures_of
 
 THUMBNAIL = 224  # pixels of the longer side
-PICTURES = 4
+IMAGES = 4
 ARRAYS, NUMBERS = 4, 64  # of an observation; of one array
 ACTIONS = 16_384  # numbers of a chunk
 
 
-def look_at(
+def make_preview(
     number: int, time: float, message: bytes | None, reply: Mapping[str, object], timing: Mapping[str, float]
-) -> Look:
+) -> Preview:
     """What to show of a call: the `message` that was answered, and its `reply`. Never raises for what is in them.
 
-    Without the message, which was too long to be kept, there is less to show.
+    Without the message, which is too long to store, there is less to show.
     """
     observation = {} if message is None else unpack(message)
     prompt = observation.get("prompt", observation.get("task", ""))
-    return Look(
+    return Preview(
         number=number,
         time=time,
         prompt=clean(prompt if isinstance(prompt, str) else ""),
         actions=_chunk(reply.get("actions")),
         numbers=_numbers(observation),
-        pictures=_pictures(observation),
+        images=_images(observation),
         timing=dict(timing),
         note="" if message is not None else "the observation is too large to be shown",
     )
@@ -53,16 +53,16 @@ def _numbers(observation: Mapping[str, object]) -> dict[str, list[float | None]]
     return dict(list(found.items())[:ARRAYS])
 
 
-def _pictures(observation: Mapping[str, object]) -> dict[str, Thumbnail]:
-    shown = list(pictures_of(observation).items())[:PICTURES]
-    return {clean(camera, 60): thumbnail(picture) for camera, picture in shown if picture.size}
+def _images(observation: Mapping[str, object]) -> dict[str, Thumbnail]:
+    shown = list(pictures_of(observation).items())[:IMAGES]
+    return {clean(camera, 60): thumbnail(image) for camera, image in shown if image.size}
 
 
-def thumbnail(picture: np.ndarray) -> Thumbnail:
+def thumbnail(pixels: np.ndarray) -> Thumbnail:
     """A small JPEG of (uint8|float)[h, w, 3]; floats are in [0, 1]."""
-    height, width = picture.shape[:2]
+    height, width = pixels.shape[:2]
     step = max(1, max(height, width) // (2 * THUMBNAIL))
-    small = picture[::step, ::step]
+    small = pixels[::step, ::step]
     if small.dtype != np.uint8:
         small = (255 * np.nan_to_num(np.clip(small.astype(np.float32), 0, 1))).astype(np.uint8)
     image = Image.fromarray(np.ascontiguousarray(small))

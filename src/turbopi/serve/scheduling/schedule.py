@@ -1,24 +1,24 @@
 """Whose turn it is: earliest deadline first, robots before simulators, batches where they pay.
 
-When more ask than can be served (a place or a firm deadline was refused within CROWDED_SECONDS), claims come before
-deadlines. A source's claim is how long it usually pauses before it asks, from its last request, answer or refusal on;
-LONG turns are as good as any longer pause. So a robot that asks five times a second has a strong claim, and a client
-that asks again at once has a weak one, however often it was refused. Of about equal claims the earlier deadline
-decides. The order goes by this, and so does who gives way in a full line: simulators to robots, then a source that
-has more than its share of the places, then the weakest claim, then the latest deadline. A quarter of the places are
-safe: those of the sources that were served longest ago, so that nobody is refused for ever. Neither a short deadline
-nor a new connection is a claim.
+When more requests come than can be served (a place or a firm deadline was refused within CROWDED_SECONDS), claims come
+before deadlines. A source's claim is its usual pause before a request, from its last request, answer or refusal on;
+pauses longer than LONG turns count the same. So a robot with five requests a second has a strong claim, and a client
+that sends its next request at once has a weak one, however often it was refused. Of about equal claims the earlier
+deadline decides. The order goes by this, and so does who gives way in a full line: simulators to robots, then a source
+that has more than its share of the places, then the weakest claim, then the latest deadline. A quarter of the places
+are safe: those of the sources that were served longest ago, so that no source is refused for ever. Neither a short
+deadline nor a new connection is a claim.
 
-A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py asks `decide`
-whenever something has changed or the moment `Decision.wake` has come, and runs the turn that it is given.
+A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py calls `decide`
+whenever something has changed or at the moment `Decision.wake`, and runs the turn that it gets.
 
 What holds:
 
 - Requests with the same deadline, priority, size and, in a crowd, claim run in the order in which they came.
-- A request may be overtaken (a turn goes to one that came later) OVERTAKEN times. Of those that were, the one that came
-  first gets every other turn at least: nobody starves, not even simulators.
-- What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
-  long; else as soon as that is so. Without one, nothing is refused for being late.
+- A request may be overtaken (a turn goes to a newer one) OVERTAKEN times. Of requests that were, the oldest gets at
+  least every other turn: nothing starves, not even simulators.
+- A request with a firm deadline that it can't meet is refused: on arrival, if its wait and its run are already too
+  long; else as soon as that is so. Without a firm deadline, nothing is refused for being late.
 - A turn has no more observations than the table T(B) says is worth it, nor than fit the earliest deadline in it.
 """
 
@@ -31,23 +31,23 @@ from statistics import median
 from typing import Any, Literal
 
 from turbopi.serve.scheduling.batch_times import SAFE, BatchTimes
-from turbopi.serve.scheduling.think_time import Pauses, Returns
+from turbopi.serve.scheduling.think_time import Pauses, ThinkTimes
 
 Priority = Literal["robot", "simulator"]
 PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
 
 OVERTAKEN = 16
-ACTIVE_SECONDS = 1.0  # who asked within it may ask again soon: company to wait for
+ACTIVE_SECONDS = 1.0  # a source with a request within it may send one soon: worth waiting for
 TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of others may be
-GAPS = 32  # times between two arrivals, the last ones: their median is how soon company comes
+GAPS = 32  # times between two arrivals, the last ones: their median is how soon the next one comes
 LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late timer must not shrink the batch
-PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
+PATIENCE = 4.0  # usual gaps without an arrival, after which the wait for more requests ends
 CROWDED_SECONDS = 1.0
-LONG = 8.0  # turns: who pauses so long takes a ninth of the policy's time at most
+LONG = 8.0  # turns: a source that pauses so long takes a ninth of the policy's time at most
 NEW = 1 / 16  # the claim of a source that wasn't seen lately: weaker than a robot's
 WEAKEST = 12  # levels of claims, from 0; one is a factor of √2
 SAFE_PLACES = 1 / 4  # of the line: those of the sources that were served longest ago
-LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
+EXPIRY_MARGIN = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
 
 
 @dataclass(eq=False)
@@ -57,13 +57,13 @@ class Request:
     arrived   when it came
     deadline  when its answer is wanted
     firm      the client said so: it is refused if it can't have its answer by then
-    source    who asks (a connection)
+    source    the client (a connection)
     session   its name, if it has one: a newer request of the session replaces one that waits
     rows      observations in it; they run together
-    later     observations of the same message that are still to be asked for: the deadline is for the last of them
+    later     observations of the same message in later requests: the deadline is for the last of them
     alone     never in a batch with others
-    joins     it joins a chunk or asks for model_actions: runs with such a request have a table T(B) of their own
-    call      what to run; not looked at here
+    joins     it joins a chunk or requests model_actions: runs with such a request have a table T(B) of their own
+    call      what to run; not read here
     """
 
     arrived: float
@@ -90,7 +90,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Refused:
-    """A request that gets no run, why, and what its client is told."""
+    """A request that gets no run, why, and the text for its client."""
 
     request: Request
     kind: Literal["busy", "late", "replaced"]
@@ -103,7 +103,7 @@ class Decision:
 
     turn     requests to run together; empty: none yet
     refused  requests to answer with a refusal
-    wake     when to ask again, if nothing changes before; None: not at all
+    wake     when to call `decide` again, if nothing changes before; None: not at all
     """
 
     turn: tuple[Request, ...] = ()
@@ -141,7 +141,7 @@ class Schedule:
 
     queue_limit  requests that may wait while a turn runs
     times        T(B); one that forms no batches by default
-    turns        how long a turn keeps the next one from beginning, where that isn't T(B): a pipelined policy
+    turns        seconds until the next turn may begin, where that isn't T(B): a pipelined policy
     joining      T(B) of runs in which a chunk is joined; by default they form no batches
     """
 
@@ -166,7 +166,7 @@ class Schedule:
         self._tight = _Recent(TIGHT_SECONDS)
         self._last_arrival = -math.inf
         self._gaps: deque[float] = deque(maxlen=GAPS)
-        self._returns = Returns()
+        self._think_times = ThinkTimes()
         self._pauses = Pauses()
         # When one was refused a place last: the numbers and sources of those that waited, and what it was.
         self._line: list[int] = []
@@ -197,13 +197,13 @@ class Schedule:
         refused = self._replace(request)
         if not request.continued and self.waiting >= self._places:
             self.crowded_until = now + CROWDED_SECONDS
-            gives_way = request if self._no_better(request) else self._gives_way(request)
+            evicted = request if self._no_better(request) else self._evicted(request)
             text = f"busy: {self.queue_limit} requests wait already (--queue-limit {self.queue_limit}); try again"
-            if gives_way is not request:
+            if evicted is not request:
                 text += " later: this one gave its place to another that pauses longer, or is more urgent"
-                self._waiting.remove(gives_way)
-            refused.append(Refused(gives_way, "busy", text))
-            if gives_way is request:
+                self._waiting.remove(evicted)
+            refused.append(Refused(evicted, "busy", text))
+            if evicted is request:
                 if request.source not in self._sources:  # not for having more than its share
                     self._refused = request.priority, request.level, request.deadline, request.served
                 return self._refuse(refused, now)
@@ -213,7 +213,7 @@ class Schedule:
         return self._refuse(refused, now)
 
     def remove(self, request: Request) -> None:
-        """Nobody waits for its answer any more."""
+        """Its client has left."""
         if request in self._waiting:
             self._waiting.remove(request)
 
@@ -237,7 +237,7 @@ class Schedule:
             self._turn_times(self._running).ran(rows, seconds, now)
         for request in self._running:
             if not request.later:
-                self._returns.answered(request.source, now)
+                self._think_times.answered(request.source, now)
                 self._pauses.served(request.source, now)
         self._running, self._free_since = (), now
 
@@ -255,11 +255,11 @@ class Schedule:
     def _refuse(self, refused: list[Refused], now: float) -> list[Refused]:
         """A source that was refused begins its pause anew."""
         for one in refused:
-            self._pauses.replied(one.request.source, now)
+            self._pauses.refused(one.request.source, now)
         return refused
 
     def _no_better(self, request: Request) -> bool:
-        """Whether it has no more claim than one that the same line refused: then it needs no closer look."""
+        """Whether its claim is no stronger than one that the same line refused: then nothing else is compared."""
         if self._refused is None or request.source in self._sources:
             return False
         if [one.number for one in self._waiting] != self._line:
@@ -268,7 +268,7 @@ class Schedule:
         same = request.priority == priority
         return same and request.level >= level and request.deadline >= deadline and request.served >= served
 
-    def _gives_way(self, request: Request) -> Request:
+    def _evicted(self, request: Request) -> Request:
         """The one of a full line and a newcomer that gets no place; the module says by which rule."""
         some = [one for one in self._waiting if not one.continued]
         some.append(request)
@@ -293,8 +293,8 @@ class Schedule:
         self._number += 1
         request.number, request.queued = self._number, now
         if not request.continued:
-            self._returns.asked(request.source, now)
-            claim, request.served = self._pauses.asked(request.source, LONG * self._seconds(request, now), NEW, now)
+            self._think_times.requested(request.source, now)
+            claim, request.served = self._pauses.requested(request.source, LONG * self._seconds(request, now), NEW, now)
             request.level = min(WEAKEST, int(-2 * math.log2(claim))) if claim > 0 and not request.slowed else WEAKEST
         priority = PRIORITIES.index(request.priority)
         request.order = priority, request.deadline, request.number
@@ -327,7 +327,7 @@ class Schedule:
             self.crowded_until = now + CROWDED_SECONDS
         return self._late(request, now, wait, run)
 
-    def _hopeless(self, now: float) -> list[Refused]:
+    def _expired(self, now: float) -> list[Refused]:
         """Those that wait and can't meet their deadline any more; they wait no longer."""
         wait = self._until_free(now)
         late = [one for one in self._waiting if one.firm and now + wait + self._seconds(one, now) > one.deadline]
@@ -344,7 +344,7 @@ class Schedule:
         return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
 
     def _turn_seconds(self, requests: Iterable[Request], now: float) -> float:
-        """For how long turns of these, which may run together, keep others from theirs."""
+        """Seconds that turns of these, which may run together, take."""
         requests = tuple(requests)
         return self._turn_times(requests).total(sum(request.rows for request in requests), now)
 
@@ -353,22 +353,22 @@ class Schedule:
         return self._joining if any(request.joins for request in requests) else self.times
 
     def _turn_times(self, requests: Iterable[Request]) -> BatchTimes:
-        """The same, of how long they keep the next turn from beginning."""
+        """The same, until the next turn may begin."""
         return self._joining if any(request.joins for request in requests) else self._turns
 
     def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
-        since, deadline = now - request.arrived, request.deadline - request.arrived
+        waited, deadline = now - request.arrived, request.deadline - request.arrived
         text = (
-            f"late: {since * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
+            f"late: {waited * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
             f"more ({wait * 1e3:.1f} ms until its turn, {run * 1e3:.1f} ms in the policy), but its deadline is "
             f"{deadline * 1e3:.1f} ms: ask earlier, or give it more time"
         )
         return Refused(request, "late", text)
 
-    def _next_hopeless(self, now: float) -> float | None:
+    def _next_expiry(self, now: float) -> float | None:
         """When the first of those that wait can't meet its deadline any more, if nothing happens before."""
-        moments = [request.deadline - self._seconds(request, now) + LATER for request in self._waiting if request.firm]
-        return min(moments, default=None)
+        moments = [one.deadline - self._seconds(one, now) for one in self._waiting if one.firm]
+        return min(moments) + EXPIRY_MARGIN if moments else None
 
     def _order(self, now: float) -> Callable[[Request], tuple[float, ...]]:
         """Robots first, then in a crowd the strongest claim, then the earliest deadline, then who came first."""
@@ -378,17 +378,18 @@ class Schedule:
 
     def decide(self, now: float) -> Decision:
         """The next turn, if one may begin. It then runs until `freed`."""
-        refused = tuple(self._hopeless(now))
-        wake = self._next_hopeless(now)
+        refused = tuple(self._expired(now))
+        wake = self._next_expiry(now)
         if self._running or not self._waiting:
             return Decision((), refused, wake)
         head, exhausted = self._head(now)
-        group = self._company(head, now)
+        group = self._candidates(head, now)
         rows = sum(request.rows for request in group)
-        until = -math.inf if exhausted or head.alone or len(group) < self.waiting else self._window(group, rows, now)
+        waits = not (exhausted or head.alone or len(group) < self.waiting)
+        until = self._batch_window(group, rows, now) if waits else -math.inf
         if until > now:
             return Decision((), refused, until if wake is None else min(until, wake))
-        turn = self._fitting(group, now)
+        turn = self._best_turn(group, now)
         for request in turn:
             self._waiting.remove(request)
         last = max(request.number for request in turn)
@@ -396,8 +397,8 @@ class Schedule:
             request.overtaken += request.number < last
         self._running, self._exhausted_last = turn, exhausted
         self._until = now + self._turn_seconds(turn, now)
-        refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
-        return Decision(turn, refused, self._next_hopeless(now))
+        refused += tuple(self._expired(now))  # those for whom this turn takes too long
+        return Decision(turn, refused, self._next_expiry(now))
 
     def _head(self, now: float) -> tuple[Request, bool]:
         """Whose turn it is, and whether that is because it was overtaken too often: such turns aren't two in a row."""
@@ -407,15 +408,15 @@ class Schedule:
             return min(exhausted, key=lambda request: request.number), True
         return min(others, key=self._order(now)), False
 
-    def _company(self, head: Request, now: float) -> list[Request]:
+    def _candidates(self, head: Request, now: float) -> list[Request]:
         """The head, and behind it in their order those that may run together with it."""
         if head.alone:
             return [head]
         others = (one for one in self._waiting if one is not head and not one.alone and one.priority == head.priority)
         return [head, *sorted(others, key=self._order(now))]
 
-    def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
-        """The first of a group, as many as pay and as keep the deadlines.
+    def _best_turn(self, group: list[Request], now: float) -> tuple[Request, ...]:
+        """The first of a group, as many as pay and meet the deadlines.
 
         If some join a chunk and others don't, these may pay more without the others.
         """
@@ -437,7 +438,7 @@ class Schedule:
         return tuple(turn)
 
     def _longest(self, group: Iterable[Request], now: float) -> float:
-        """Seconds that a batch may take: for the deadlines in it, and for a robot that may ask while it runs.
+        """Seconds that a batch may take: for the deadlines in it, and for a robot whose request may come while it runs.
 
         A robot whose deadline is shorter than two runs has no guarantee, and none is tried for it.
         """
@@ -450,16 +451,16 @@ class Schedule:
         return max(alone, min(slacks, default=math.inf))
 
     def part(self, rows: int, now: float) -> int:
-        """Of `rows` observations of one message, how many to ask for at once."""
+        """Of `rows` observations of one message, how many to run together."""
         return self.times.best(rows, now, self._longest((), now))
 
-    def _window(self, group: list[Request], rows: int, now: float) -> float:
-        """Until when to wait for company; it is over if that isn't later than now.
+    def _batch_window(self, group: list[Request], rows: int, now: float) -> float:
+        """Until when to wait for more requests; not at all if that isn't later than now.
 
-        Company is waited for if it saves more time than it takes to come: clients that were answered and usually ask
-        again so soon, as long as the saving after they were expected; or else anybody at the usual pace, as long as the
-        saving and not longer than a few usual gaps after the last arrival. Only while all deadlines of the group leave
-        room for T(B).
+        The wait must save more time than it takes. Clients that were answered and have a short think time are waited
+        for as long as the saving after they were expected; else any client at the usual pace, as long as the saving
+        and not longer than a few usual gaps after the last arrival. Only while all deadlines of the group leave room
+        for T(B).
         """
         times = self._times(group)
         sources = {request.source for request in group}
@@ -477,7 +478,7 @@ class Schedule:
             safe = times.seconds(rows + more, now, SAFE)
             return -math.inf if safe is None else deadline - safe - LATE_TIMER
 
-        expected = self._returns.expected(now, ACTIVE_SECONDS, sources)[:places]
+        expected = self._think_times.expected(now, ACTIVE_SECONDS, sources)[:places]
         for more in range(len(expected), 0, -1):
             when, last = expected[more - 1]
             if when - now < saving(more) and (until := min(last, when + saving(more), latest(more))) > now:

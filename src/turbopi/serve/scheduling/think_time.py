@@ -1,66 +1,68 @@
-"""How soon clients ask again once they were answered. From times alone; no clock of its own.
+"""Think time: from an answer to the same client's next request. Computed from given times; no clock of its own.
 
-Clients that ask again as soon as they have their actions, such as simulators and robots that stand still meanwhile,
-come back together after a batch, a few milliseconds later. schedule.py waits for them where that pays.
+Clients of a short think time, such as simulators and robots that stand still meanwhile, send their next requests
+together a few milliseconds after a batch. schedule.py waits for them where that saves time.
 """
 
 from collections import OrderedDict, deque
 from collections.abc import Container, Hashable
 from dataclasses import dataclass
 
-KEPT = 5  # returns of a source, the last ones
-FEW = 2  # that tell something
-TYPICAL = 3 / 4  # the quantile of the kept ones that counts as a source's usual return
-# LATER * its usual return + LATER_SECONDS after its answer, a source isn't expected any more this time.
-LATER = 2.0
-LATER_SECONDS = 0.0005
-MOST = 1024  # sources that are remembered
+HISTORY = 5  # think times of a source, the last ones
+MIN_SAMPLES = 2  # fewer say nothing
+TYPICAL = 3 / 4  # the quantile of these that counts as a source's usual think time
+# GIVE_UP_FACTOR * its usual think time + GIVE_UP_SECONDS after its answer, a source isn't expected any more.
+GIVE_UP_FACTOR = 2.0
+GIVE_UP_SECONDS = 0.0005
+MAX_SOURCES = 1024  # sources that are remembered
 MEAN_OF = 4  # a new pause counts as one of so many
 
 
-class Returns:
-    """When sources that were answered are expected to ask again."""
+class ThinkTimes:
+    """When sources that were answered are expected to send their next requests."""
 
     def __init__(self) -> None:
-        self._answered: OrderedDict[Hashable, float] = OrderedDict()  # those that haven't asked again
-        self._seconds: OrderedDict[Hashable, deque[float]] = OrderedDict()  # the one that asked last at the end
+        self._answered: OrderedDict[Hashable, float] = OrderedDict()  # those without a new request
+        self._seconds: OrderedDict[Hashable, deque[float]] = OrderedDict()  # the one with the last request at the end
 
     def answered(self, source: Hashable, now: float) -> None:
         """A turn with a source's request has ended."""
         self._answered[source] = now
         self._answered.move_to_end(source)
-        if len(self._answered) > MOST:
+        if len(self._answered) > MAX_SOURCES:
             self._answered.popitem(last=False)
 
-    def asked(self, source: Hashable, now: float) -> None:
+    def requested(self, source: Hashable, now: float) -> None:
         """A source's request has come."""
-        since = self._answered.pop(source, None)
-        if since is None:
+        answered = self._answered.pop(source, None)
+        if answered is None:
             return
-        self._seconds.setdefault(source, deque(maxlen=KEPT)).append(now - since)
+        self._seconds.setdefault(source, deque(maxlen=HISTORY)).append(now - answered)
         self._seconds.move_to_end(source)
-        if len(self._seconds) > MOST:
+        if len(self._seconds) > MAX_SOURCES:
             self._seconds.popitem(last=False)
 
     def expected(self, now: float, within: float, but: Container[Hashable]) -> list[tuple[float, float]]:
-        """(when it is expected, when it isn't any more) of each source that may ask again soon; the earliest first.
+        """(when it is expected, when it isn't any more) of each source that may send a request soon, in order of time.
 
-        within  seconds: who was answered longer ago isn't expected
+        within  seconds: a source that was answered longer ago isn't expected
         but     sources that are left out
         """
         while self._answered and next(iter(self._answered.values())) < now - within:
-            self._answered.popitem(last=False)  # it asks too rarely to be waited for
+            self._answered.popitem(last=False)  # its requests are too rare to wait for
         found = []
-        for source, since in self._answered.items():
+        for source, answered in self._answered.items():
             usual = self._usual(source)
-            if usual is not None and source not in but and (last := since + usual * LATER + LATER_SECONDS) > now:
-                found.append((since + usual, last))
+            if usual is not None and source not in but:
+                last = answered + usual * GIVE_UP_FACTOR + GIVE_UP_SECONDS
+                if last > now:
+                    found.append((answered + usual, last))
         return sorted(found)
 
     def _usual(self, source: Hashable) -> float | None:
         """Seconds from an answer to the next request; None if that isn't known."""
         seconds = self._seconds.get(source)
-        if seconds is None or len(seconds) < FEW:
+        if seconds is None or len(seconds) < MIN_SAMPLES:
             return None
         return sorted(seconds)[min(len(seconds) - 1, int(TYPICAL * len(seconds)))]
 
@@ -74,12 +76,12 @@ class _Source:
 
 
 class Pauses:
-    """How long sources usually pause before they ask, and when they were served last."""
+    """How long sources usually pause before a request, and when they were served last."""
 
     def __init__(self) -> None:
         self._sources: OrderedDict[Hashable, _Source] = OrderedDict()  # the one with the last event at the end
 
-    def asked(self, source: Hashable, long: float, new: float, now: float) -> tuple[float, float]:
+    def requested(self, source: Hashable, long: float, new: float, now: float) -> tuple[float, float]:
         """A request has come. Its source's usual pause, from 0 to 1, and when that was served last or came first.
 
         long  seconds of a pause that counts as 1
@@ -88,7 +90,7 @@ class Pauses:
         known = self._sources.get(source)
         if known is None:
             known = self._sources[source] = _Source(now, now, new)
-            if len(self._sources) > MOST:
+            if len(self._sources) > MAX_SOURCES:
                 self._sources.popitem(last=False)
         else:
             pause = now - known.event
@@ -97,7 +99,7 @@ class Pauses:
             self._note(source, known, now)
         return known.usual, known.served
 
-    def replied(self, source: Hashable, now: float) -> None:
+    def refused(self, source: Hashable, now: float) -> None:
         """A request of the source was refused."""
         if (known := self._sources.get(source)) is not None:
             self._note(source, known, now)

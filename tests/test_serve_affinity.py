@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from turbopi.serve.fleet.replica import Line
-from turbopi.serve.fleet.session_affinity import ACTIVE_SECONDS, MOST, SOON_SECONDS, Homes
+from turbopi.serve.fleet.session_affinity import ACTIVE_SECONDS, MAX_CLIENTS, SOON_SECONDS, SessionAffinity
 
 
-def homes(clients: int, of: str = "left", at: float = 0.0) -> Homes:
+def homes(clients: int, of: str = "left", at: float = 0.0) -> SessionAffinity:
     """`clients` of them, numbered from 0, that this replica has answered."""
-    made = Homes()
+    made = SessionAffinity()
     for client in range(clients):
         made.answered(client, of, at)
     return made
@@ -24,19 +24,21 @@ def homes(clients: int, of: str = "left", at: float = 0.0) -> Homes:
 
 def test_who_asks_again_at_once_comes_back_to_the_replica_that_answered() -> None:
     made, counts = homes(4), {"left": 1, "right": 0}
-    assert made.of(0, counts, 0.01) == "left"
-    assert made.of(0, counts, SOON_SECONDS + 0.01) is None, "it has no company that comes back together with it"
-    assert made.of("a new one", counts, 0.01) is None
+    assert made.replica_for(0, counts, 0.01) == "left"
+    assert made.replica_for(0, counts, SOON_SECONDS + 0.01) is None, (
+        "it has no company that comes back together with it"
+    )
+    assert made.replica_for("a new one", counts, 0.01) is None
     made.answered(0, "right", 0.02)
-    assert made.of(0, counts, 0.03) == "right"
+    assert made.replica_for(0, counts, 0.03) == "right"
 
 
 def test_no_replica_has_more_than_its_share_of_the_clients() -> None:
     made = homes(8)
-    assert [made.of(0, {"left": there, "right": 0}, 0.01) for there in (3, 4)] == ["left", None]
-    assert made.of(0, {"left": 4}, 0.01) == "left", "all are its own"
+    assert [made.replica_for(0, {"left": there, "right": 0}, 0.01) for there in (3, 4)] == ["left", None]
+    assert made.replica_for(0, {"left": 4}, 0.01) == "left", "all are its own"
     made = homes(9)
-    assert made.of(0, {"left": 4, "right": 0}, 0.01) == "left", "nine are five and four"
+    assert made.replica_for(0, {"left": 4, "right": 0}, 0.01) == "left", "nine are five and four"
 
 
 def test_clients_that_left_have_no_share() -> None:
@@ -44,16 +46,19 @@ def test_clients_that_left_have_no_share() -> None:
     later = ACTIVE_SECONDS + 0.01
     for client in range(2):
         made.answered(client, "left", later)
-    assert [made.of(0, {"left": there, "right": 0}, later) for there in (0, 1)] == ["left", None]
+    assert [made.replica_for(0, {"left": there, "right": 0}, later) for there in (0, 1)] == ["left", None]
 
 
 def test_a_replica_that_is_gone_is_nobodys() -> None:
-    assert homes(4).of(0, {"right": 0}, 0.01) is None
+    assert homes(4).replica_for(0, {"right": 0}, 0.01) is None
 
 
 def test_clients_are_forgotten() -> None:
-    made = homes(3 * MOST)
-    assert made.of(0, {"left": 0}, 0.0) is None and made.of(3 * MOST - 1, {"left": 0}, 0.0) == "left"
+    made = homes(3 * MAX_CLIENTS)
+    assert (
+        made.replica_for(0, {"left": 0}, 0.0) is None
+        and made.replica_for(3 * MAX_CLIENTS - 1, {"left": 0}, 0.0) == "left"
+    )
 
 
 def test_the_router_notes_answers_on_its_own_loop_although_ray_tells_of_them_on_another_thread(
@@ -74,9 +79,9 @@ def test_the_router_notes_answers_on_its_own_loop_although_ray_tells_of_them_on_
 
     def answered(*given: Any) -> None:
         threads.append(threading.get_ident())
-        Homes.answered(router._homes, *given)
+        SessionAffinity.answered(router._affinity, *given)
 
-    monkeypatch.setattr(router._homes, "answered", answered)
+    monkeypatch.setattr(router._affinity, "answered", answered)
 
     def end(callback: Callable[[Any], None]) -> None:
         thread = threading.Thread(target=callback, args=(None,))

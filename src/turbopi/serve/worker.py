@@ -1,4 +1,4 @@
-"""One thread that runs the policy, for the turns that schedule.py decides about."""
+"""One thread that runs the policy, in the turns that scheduling/schedule.py decides."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-from turbopi.serve.outcome import Outcome
+from turbopi.serve.requests import STOPPING, Result
 from turbopi.serve.scheduling.schedule import Refused, Request, Schedule
 
 logger = logging.getLogger(__name__)
@@ -21,19 +21,18 @@ logger = logging.getLogger(__name__)
 R = TypeVar("R")
 
 DRAIN_SECONDS = 10.0
-STOPPING = Outcome(0.0, wrong="stopping", text="the server is shutting down")
 
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a turn.
+    """The results of a turn.
 
-    answers  of each request: an outcome of each of its rows; a Future of that, if its work goes on elsewhere; or None:
-             it shall run again, alone
-    seconds  in the policy, if they tell how long such a turn takes
+    results  of each request: a result of each of its rows; a Future of these, if its work goes on elsewhere; or None:
+             the request runs again, in a turn of its own
+    seconds  in the policy, if such a turn usually takes as long
     """
 
-    answers: Sequence[list[Outcome] | Future[list[Outcome]] | None]
+    results: Sequence[list[Result] | Future[list[Result]] | None]
     seconds: float | None = None
 
 
@@ -41,19 +40,19 @@ class Worker:
     """Runs turns, one at a time, always on the same thread. For the event loop's thread alone.
 
     One thread because a policy isn't re-entrant, and always the same one because a CUDA device is chosen per thread.
-    `run(requests)` is called on it; it never raises. A turn may also only begin its work (a Future among its answers):
-    then the next turn begins while that goes on.
+    `run(requests)` is called on it; it never raises. A turn may also only begin its work (a Future among its results):
+    then the next turn begins while that work runs.
     """
 
     def __init__(self, schedule: Schedule, run: Callable[[tuple[Request, ...]], Ran] | None = None) -> None:
         self.schedule, self._run = schedule, run
         # A queue and not an executor, whose Future costs a turn twice as much as the queue does.
         self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._perform, name="turbopi-inference", daemon=True)
+        self._thread = threading.Thread(target=self._run_work, name="turbopi-inference", daemon=True)
         self._closed = False
         self._turns = 0  # on the thread or on their way
-        self._answers: dict[Request, asyncio.Future[list[Outcome]]] = {}
-        self._going: set[Future[Any]] = set()  # work that turns began
+        self._waiting: dict[Request, asyncio.Future[list[Result]]] = {}  # until they have their results
+        self._background: set[Future[Any]] = set()  # work that turns began
         self._idle: asyncio.Future[None] | None = None  # `drain` waits for it
         self._timer: asyncio.TimerHandle | None = None
         self._stopping = False
@@ -65,8 +64,8 @@ class Worker:
 
     @property
     def running(self) -> bool:
-        """A turn is on the thread, or what one began goes on."""
-        return bool(self._turns or self._going)
+        """Whether a turn is on the thread, or work that a turn began still runs."""
+        return bool(self._turns or self._background)
 
     async def call(self, function: Callable[[], R]) -> R:
         """`function()` on the thread: before there are requests. Raises what it raises."""
@@ -81,45 +80,45 @@ class Worker:
         self._put(perform)
         return await asyncio.wrap_future(answer)
 
-    def ask(self, request: Request) -> "asyncio.Future[list[Outcome]]":
-        """An outcome of each row of the request, once it has them: what is wrong if it gets no turn.
+    def submit(self, request: Request) -> "asyncio.Future[list[Result]]":
+        """A result of each row of the request, once it had its turn; one with an error if it is refused a turn.
 
-        Cancelled while it waits, it never runs; while it runs, that ends unheard.
+        Cancelled while it waits, it never runs; cancelled while it runs, its results are dropped.
         """
-        answer: asyncio.Future[list[Outcome]] = asyncio.get_running_loop().create_future()
+        results: asyncio.Future[list[Result]] = asyncio.get_running_loop().create_future()
         if self._stopping:
-            answer.set_result([STOPPING])
-            return answer
-        self._answers[request] = answer
-        answer.add_done_callback(partial(self._left, request))
+            results.set_result([STOPPING])
+            return results
+        self._waiting[request] = results
+        results.add_done_callback(partial(self._remove_cancelled, request))
         self._refuse(self.schedule.add(request, time.perf_counter()))
         self._next()
-        return answer
+        return results
 
     def stop(self) -> None:
-        """Turn away the requests that wait, and all that come; the running turn goes on."""
+        """Refuse the requests that wait, and all new ones; the running turn goes on."""
         self._stopping = True
         for request in self.schedule.stop():
             self._answer(request, [STOPPING])
         self._set_timer(None)
 
     async def drain(self) -> None:
-        """Wait for the running turn to end, if there is one, and for all that turns began. Call `stop` first.
+        """Wait for the running turn to end, if there is one, and for all work that turns began. Call `stop` first.
 
-        A policy that never ends holds nobody: after DRAIN_SECONDS and twice its usual time the log says so, and its
-        requests are turned away.
+        A policy that never ends blocks nothing: after DRAIN_SECONDS and twice its usual time the log says so, and its
+        requests are refused.
         """
         if not self.running:
             return
         usual = self.schedule.times.seconds(1, time.perf_counter()) or 0.0
-        seconds = DRAIN_SECONDS + 2 * usual * max(self._turns, len(self._going))
+        seconds = DRAIN_SECONDS + 2 * usual * max(self._turns, len(self._background))
         self._idle = asyncio.get_running_loop().create_future()
         try:
             await asyncio.wait_for(self._idle, seconds)
         except asyncio.TimeoutError:
             text = "stopping without %d calls of the policy, which haven't ended within %.0f s"
-            logger.error(text, self._turns + len(self._going), seconds)
-            for request in tuple(self._answers):
+            logger.error(text, self._turns + len(self._background), seconds)
+            for request in tuple(self._waiting):
                 self._answer(request, [STOPPING])
 
     def close(self) -> None:
@@ -139,43 +138,43 @@ class Worker:
         self._set_timer(decision.wake)
         if decision.turn:
             self._turns += 1
-            self._put(partial(self._take, decision.turn, asyncio.get_running_loop()))
+            self._put(partial(self._run_turn, decision.turn, asyncio.get_running_loop()))
 
     def _ended(self, turn: tuple[Request, ...], ran: Ran) -> None:
         self._turns -= 1
         self.schedule.freed(time.perf_counter(), ran.seconds)
-        for request, answer in zip(turn, ran.answers, strict=True):
-            if answer is None and request in self._answers:
+        for request, results in zip(turn, ran.results, strict=True):
+            if results is None and request in self._waiting:
                 self.schedule.put_back(request)
         self._next()  # first: the policy shouldn't wait for what follows
-        for request, answer in zip(turn, ran.answers, strict=True):
-            if isinstance(answer, Future):
-                self._follow(answer, request)
-            elif answer is not None:
-                self._answer(request, answer)
-        self._look_if_idle()
+        for request, results in zip(turn, ran.results, strict=True):
+            if isinstance(results, Future):
+                self._answer_later(request, results)
+            elif results is not None:
+                self._answer(request, results)
+        self._check_idle()
 
-    def _follow(self, future: "Future[list[Outcome]]", request: Request) -> None:
+    def _answer_later(self, request: Request, future: "Future[list[Result]]") -> None:
         """Answer the request in the event loop when `future` is done.
 
-        A Future keeps its callbacks: none may refer to it, or what they hold (observations) would wait for the garbage
-        collector.
+        A Future stores its callbacks: if one referred to the Future, its observations would stay in memory until the
+        next garbage collection.
         """
         loop = asyncio.get_running_loop()
 
-        def tell(done: "Future[list[Outcome]]") -> None:
+        def done(ended: "Future[list[Result]]") -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(self._finished, request, done)
+                loop.call_soon_threadsafe(self._finished, request, ended)
 
-        self._going.add(future)
-        future.add_done_callback(tell)
+        self._background.add(future)
+        future.add_done_callback(done)
 
-    def _finished(self, request: Request, future: "Future[list[Outcome]]") -> None:
-        self._going.discard(future)
+    def _finished(self, request: Request, future: "Future[list[Result]]") -> None:
+        self._background.discard(future)
         self._answer(request, future.result())
-        self._look_if_idle()
+        self._check_idle()
 
-    def _look_if_idle(self) -> None:
+    def _check_idle(self) -> None:
         if self._idle is not None and not self.running:
             if not self._idle.done():
                 self._idle.set_result(None)
@@ -183,16 +182,16 @@ class Worker:
 
     def _refuse(self, refused: Iterable[Refused]) -> None:
         for one in refused:
-            self._answer(one.request, [Outcome(0.0, wrong=one.kind, text=one.text)])
+            self._answer(one.request, [Result(0.0, error=one.kind, text=one.text)])
 
-    def _answer(self, request: Request, outcomes: list[Outcome]) -> None:
-        answer = self._answers.pop(request, None)
-        if answer is not None and not answer.done():
-            answer.set_result(outcomes)
+    def _answer(self, request: Request, results: list[Result]) -> None:
+        waiting = self._waiting.pop(request, None)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(results)
 
-    def _left(self, request: Request, answer: "asyncio.Future[list[Outcome]]") -> None:
-        if answer.cancelled():
-            self._answers.pop(request, None)
+    def _remove_cancelled(self, request: Request, results: "asyncio.Future[list[Result]]") -> None:
+        if results.cancelled():
+            self._waiting.pop(request, None)
             self.schedule.remove(request)
 
     def _set_timer(self, when: float | None) -> None:
@@ -211,18 +210,18 @@ class Worker:
             self._thread.start()
         self._work.put(work)
 
-    def _perform(self) -> None:
+    def _run_work(self) -> None:
         while (work := self._work.get()) is not None:
             work()
-            del work  # a thread that waits holds nothing
+            del work  # an idle thread must not hold an observation in memory
 
-    def _take(self, turn: tuple[Request, ...], loop: asyncio.AbstractEventLoop) -> None:
-        """On the thread: a turn."""
+    def _run_turn(self, turn: tuple[Request, ...], loop: asyncio.AbstractEventLoop) -> None:
+        """Run a turn, on the thread."""
         assert self._run is not None
         try:
             ran = self._run(turn)
-        except BaseException as error:  # a fault of this server: nobody shall wait for ever
+        except BaseException as error:  # a fault of this server: its requests must be answered all the same
             text = "".join(traceback.format_exception(error))
-            ran = Ran([[Outcome(0.0, wrong="policy", text=text)] * request.rows for request in turn])
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+            ran = Ran([[Result(0.0, error="policy", text=text)] * request.rows for request in turn])
+        with contextlib.suppress(RuntimeError):  # the loop is closed: no request waits
             loop.call_soon_threadsafe(self._ended, turn, ran)

@@ -1,0 +1,482 @@
+"""A request's life: from a message of a client to the answer that is sent.
+
+    decode   msgpack -> a map
+    read     the map -> ClientRequest: the observation, its call options and scheduling options
+    run      ClientRequest -> scheduling.schedule.Request, submitted to `Calls`; one Result an observation
+    answer   results -> the map to send, or the refusal
+
+docs/dev/request.md follows one observation all the way; docs/serving.md has the keys as tables.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from turbopi.realtime.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
+from turbopi.realtime.wire import Unpacker, WireError
+from turbopi.serve.connection import GuardedConnection
+from turbopi.serve.metrics import Metrics
+from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS, ServerOptions
+from turbopi.serve.real_time import Plan, RealTime
+from turbopi.serve.scheduling.schedule import PRIORITIES, Priority, Request
+from turbopi.support.errors import ObservationError
+
+MAX_BATCH_ROWS = 1024  # B of one batch message
+LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
+TIMING = "policy_timing"
+REFUSALS = {  # texts by kind of error; all others are sent as they are
+    "observation": "bad observation: {}",
+    "actions": "bad actions: {}",
+    "lost": "the device is lost: {}",
+    "replica": "the replica is lost: {}",
+}
+
+ErrorKind = Literal["observation", "actions", "lost", "replica", "policy", "busy", "late", "replaced", "stopping"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one observation: the policy's `answer`, or the kind of `error` and its `text`.
+
+    error    "observation": the client's fault; "actions": the model's actions may not reach a robot; "lost": the device
+             failed for good; "replica": a fleet's replica gave no answer; "policy": any other failure of the policy,
+             `text` is the traceback; "busy", "late", "replaced", "stopping": it got no turn
+    seconds  in the policy
+    batch    observations in its run
+    run      the run's number: observations of one run share it
+    """
+
+    seconds: float
+    answer: dict[str, Any] | None = None
+    error: ErrorKind | None = None
+    text: str = ""
+    batch: int = 1
+    run: int = 0
+
+
+STOPPING = Result(0.0, error="stopping", text="the server is shutting down")
+
+
+class Calls(Protocol):
+    """Where requests are computed: calls.PolicyCalls, in this process, or the replicas of a fleet."""
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for their turn, as far as this process knows."""
+
+    @property
+    def running(self) -> bool: ...
+
+    @property
+    def largest(self) -> int:
+        """Observations of the largest batch message that isn't split."""
+
+    @property
+    def unwell(self) -> str | None:
+        """Why no request can be computed at the moment, if known: `/healthz` answers with it."""
+
+    def waits(self, session: str) -> bool:
+        """Whether a request of that session waits: a newer one would replace it."""
+
+    async def warm_up(self, **arguments: Any) -> None:
+        """Be ready for requests. `arguments` are those of the policy's `warmup`; raises what it raises."""
+
+    def submit(
+        self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
+    ) -> "asyncio.Future[list[Result]]":
+        """One result, once the request had its turn or is refused one. May be cancelled.
+
+        arguments  of the policy's `infer`, besides the observation
+        """
+
+    async def submit_batch(
+        self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
+    ) -> list[Result]:
+        """A result of each of `rows` observations, up to the first few that hold an error.
+
+        make  the request for a part: of its rows, and of the rows that follow in later parts
+        row   the observation of a row, from 0
+        """
+
+    def stop(self) -> None:
+        """Refuse the requests that wait, and all new ones; the running turn goes on."""
+
+    async def drain(self) -> None:
+        """Wait for what runs. Call `stop` first."""
+
+    def close(self) -> None:
+        """Submit nothing more, and end the threads; they aren't waited for long."""
+
+
+# --- handling ---------------------------------------------------------------------------------------------------------
+
+
+class Refusal(NamedTuple):
+    """Why a request gets no actions: `kind` for the metrics, `text` for the client."""
+
+    kind: str
+    text: str
+
+
+class Reply(NamedTuple):
+    """The map to send, with "server_timing", and what the request said about scheduling."""
+
+    result: dict[str, Any]
+    scheduling: "SchedulingOptions"
+
+
+class ClientLeft(Exception):
+    """The client disconnected before its actions were ready."""
+
+
+class PolicyFailed(Exception):
+    """The policy raised something that isn't the client's fault; holds the traceback's text."""
+
+
+@dataclass(frozen=True)
+class ClientRequest:
+    """A message that was read: what to run (`plan`), when (`scheduling`), and for whom."""
+
+    plan: Plan
+    scheduling: "SchedulingOptions"
+    connection: GuardedConnection
+    arrived: float
+
+    def scheduled(self, rows: int = 1, remaining: int = 0) -> Request:
+        """What the schedule gets, for `rows` observations of which `remaining` others follow in later parts."""
+        scheduling, connection = self.scheduling, self.connection
+        first = rows + remaining == (scheduling.batch or 1)
+        # Without a deadline of its own, a message's later part queues behind requests that came meanwhile.
+        queued = self.arrived if first or scheduling.firm else time.perf_counter()
+        return Request(
+            arrived=self.arrived,
+            deadline=queued + scheduling.deadline,
+            firm=scheduling.firm,
+            priority=scheduling.priority,
+            source=connection.id,
+            slowed=connection.slowed,
+            session=self.plan.name,
+            rows=rows,
+            later=remaining,
+            alone=connection.bad_in_a_row
+            > 0,  # after a bad request the next is likely bad, too: it must spoil no batch
+        )
+
+
+class RequestHandler:
+    """Handles the requests of all clients of one policy. For the event loop's thread alone.
+
+    strict    a batch message above the largest batch that was measured is refused instead of split
+    why_lost  why no request can be served any more; None while all is well
+    """
+
+    def __init__(
+        self,
+        calls: Calls,
+        real_time: RealTime,
+        metrics: Metrics,
+        options: ServerOptions,
+        max_bytes: int,
+        *,
+        strict: bool,
+        why_lost: Callable[[], str | None],
+    ) -> None:
+        self._calls, self._real_time, self._metrics, self._options = calls, real_time, metrics, options
+        self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
+        self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
+
+    async def handle(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> Reply | Refusal:
+        """The reply to a message. Raises PolicyFailed and ClientLeft."""
+        if (lost := self._why_lost()) is not None:
+            return Refusal("lost", REFUSALS["lost"].format(lost))
+        try:
+            request = self.read(await self._decode(connection, message), connection, arrived)
+        except WireError as error:
+            return Refusal("malformed", f"bad request: {error}")
+        except ObservationError as error:
+            return Refusal("observation", REFUSALS["observation"].format(error))
+        results = await self._run(request)
+        failed = first_error(request, results)
+        self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
+        if failed is None:
+            return Reply(self._answer(request, results), request.scheduling)
+        if failed.error == "policy":
+            raise PolicyFailed(failed.text)
+        assert failed.error is not None
+        return Refusal(failed.error, REFUSALS.get(failed.error, "{}").format(failed.text))
+
+    def close(self) -> None:
+        """End the decoding thread. It isn't waited for."""
+        self._decoder.shutdown(wait=False)
+
+    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
+        """The message as a map. Raises WireError."""
+        started = time.perf_counter()
+        try:
+            if len(message) < LARGE:
+                return decode(message, self._max_bytes, connection.unpacker)
+            loop = asyncio.get_running_loop()
+            return await loop.run_in_executor(self._decoder, decode, message, self._max_bytes, Unpacker())
+        finally:
+            connection.took(time.perf_counter() - started)
+
+    def read(self, received: Mapping[str, Any], connection: GuardedConnection, arrived: float) -> ClientRequest:
+        """Raises ObservationError for keys and values that can't be right."""
+        scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
+        if scheduling.batch is None:
+            return ClientRequest(self._real_time.plan(received, connection), scheduling, connection, arrived)
+        check_batch_keys(received, execution=self._options.execution is not None)
+        largest = self._calls.largest
+        if self._strict and scheduling.batch > largest:
+            raise ObservationError(
+                f"{PREFIX}batch is {scheduling.batch}, and the largest batch that warm-up covered is {largest}: a "
+                "server with --strict splits none. Send smaller ones, or start it with a larger --max-batch"
+            )
+        plan = self._real_time.plan(received, connection)
+        check_batch_shapes(plan.observation, scheduling.batch)
+        return ClientRequest(plan, scheduling, connection, arrived)
+
+    async def _run(self, request: ClientRequest) -> list[Result]:
+        """Submit it and wait for a result of each observation. Raises ClientLeft if the client leaves first."""
+        plan, batch, disconnected = request.plan, request.scheduling.batch, request.connection.connection_lost_waiter
+        if batch is None:
+            results = self._calls.submit(request.scheduled(), plan.observation, plan.arguments)
+        else:
+            row = partial(batch_row, plan.observation)
+            results = asyncio.ensure_future(self._calls.submit_batch(request.scheduled, row, batch))
+
+        def cancel(_: object) -> None:
+            results.cancel()
+
+        disconnected.add_done_callback(cancel)
+        try:
+            return await results  # without a task of its own, which would cost several turns of the event loop
+        except asyncio.CancelledError:
+            if disconnected.done():
+                raise ClientLeft from None
+            raise
+        finally:
+            disconnected.remove_done_callback(cancel)
+            self._real_time.release(plan)
+
+    def _answer(self, request: ClientRequest, results: Sequence[Result]) -> dict[str, Any]:
+        """The map to send, of results that all have actions; with "server_timing"."""
+        if request.scheduling.batch is None:
+            (result,) = results
+            assert result.answer is not None
+            server_timing: dict[str, float] = {"infer_ms": result.seconds * 1e3}
+            if result.batch > 1:
+                server_timing["batch"] = result.batch
+            return {**self._real_time.finish(request.plan, result.answer), "server_timing": server_timing}
+        answers = [result.answer for result in results if result.answer is not None]
+        runs = list({result.run: result for result in results}.values())
+        server_timing = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
+        timing = sum_timings([run.answer.get(TIMING, {}) for run in runs if run.answer is not None])
+        return {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
+
+
+def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
+    """The map that a message holds. Raises WireError."""
+    if isinstance(message, str):
+        raise WireError("a request is a binary frame with a msgpack map, not a text frame")
+    observation = unpacker.unpack(message, max_bytes=max_bytes)
+    if not isinstance(observation, dict):
+        raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
+    if not all(isinstance(key, str) for key in observation):
+        raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
+    return observation
+
+
+def first_error(request: ClientRequest, results: Sequence[Result]) -> Result | None:
+    """The first result without actions, its row in the text; None if all have actions."""
+    batch = request.scheduling.batch
+    for row, result in enumerate(results):
+        if result.error in ("observation", "actions") and batch is not None:
+            return replace(result, text=f"row {row} of {batch} (from 0): {result.text}")
+        if result.error == "actions" and (previous := request.plan.requested.previous) is not None:
+            largest = float(abs(previous.left_over).max())
+            text = f"{result.text}. This request's {PREFIX}previous has values up to {largest:.3g}, and most "
+            text += "normalised actions are from -1 to 1: if they are far off, look there first"
+            return replace(result, text=text)
+        if result.error is not None:
+            return result
+    return None
+
+
+# --- scheduling options -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SchedulingOptions:
+    """When a request wants its answer, and for whom: optional keys of a message, which the policy never sees.
+
+    deadline  seconds from its arrival to its answer
+    firm      the client gave this deadline: a request that can't meet it is refused. False: it is the server's default,
+              for which nothing is refused
+    priority  robots come before simulators
+    batch     B of a batch message; None: one observation, without a batch axis
+    """
+
+    deadline: float
+    firm: bool = False
+    priority: Priority = "robot"
+    batch: int | None = None
+
+
+def read_scheduling(
+    received: Mapping[str, Any], default_ms: float, control_hz: float | None = None
+) -> SchedulingOptions:
+    """The scheduling options of a message. Raises ObservationError for values that can't be right.
+
+    default_ms  the deadline of a message that gives none
+    control_hz  of robots that don't give it; None: unknown
+    """
+    given = {key: received[PREFIX + key] for key in SCHEDULING_KEYS if PREFIX + key in received}
+    if not given:
+        return SchedulingOptions(default_ms / 1e3)
+    batch = _whole(given, "batch", 1, MAX_BATCH_ROWS)
+    priority = given.get("priority", "robot" if batch is None else "simulator")
+    if not isinstance(priority, str) or priority not in PRIORITIES:
+        raise ObservationError(f"{PREFIX}priority is {priority!r:.100}; it should be one of {', '.join(PRIORITIES)}")
+    deadline = _deadline(given, control_hz)
+    return SchedulingOptions(default_ms / 1e3 if deadline is None else deadline, deadline is not None, priority, batch)
+
+
+def _deadline(given: Mapping[str, Any], control_hz: float | None) -> float | None:
+    """Seconds; None if the message gives no deadline."""
+    if "deadline_ms" in given:
+        for other in ("left", "control_hz"):
+            if other in given:
+                raise ObservationError(f"{PREFIX}deadline_ms and {PREFIX}{other} were both given: one deadline will do")
+        milliseconds = _number(given, "deadline_ms", MAX_DEADLINE_MS)
+        if milliseconds <= 0:
+            raise ObservationError(
+                f"{PREFIX}deadline_ms is {milliseconds:g}: that has passed when the request comes. It should be the "
+                f"milliseconds from its arrival to its answer, more than 0 and at most {MAX_DEADLINE_MS:g}"
+            )
+        return milliseconds / 1e3
+    hz = _number(given, "control_hz", MAX_CONTROL_HZ) if "control_hz" in given else control_hz
+    if "control_hz" in given and (hz is None or hz <= 0):
+        raise ObservationError(f"{PREFIX}control_hz is {hz:g}; it should be more than 0")
+    if "left" not in given:
+        if "control_hz" in given:
+            raise ObservationError(
+                f"{PREFIX}control_hz came without {PREFIX}left, the actions that the robot has left to carry out"
+            )
+        return None
+    left = _whole(given, "left", 0, MAX_STEP)
+    assert left is not None
+    if hz is None:
+        raise ObservationError(
+            f"{PREFIX}left came without {PREFIX}control_hz, the actions that the robot carries out in a second"
+        )
+    if left == 0:
+        raise ObservationError(
+            f"{PREFIX}left is 0, so the deadline has passed when the request comes: a robot that has nothing left to "
+            "carry out leaves the key out"
+        )
+    return min(left / hz, MAX_DEADLINE_MS / 1e3)
+
+
+def _number(given: Mapping[str, Any], key: str, most: float) -> float:
+    value = as_number(given[key])
+    if value is None or not -MAX_STEP <= value <= most:  # NaN isn't, nor a whole number too large for a float
+        shown = f"{PREFIX}{key} is {given[key]!r:.100}"
+        raise ObservationError(f"{shown}; it should be a number, more than 0 and at most {most:g}")
+    return float(value)
+
+
+def _whole(given: Mapping[str, Any], key: str, least: int, most: int) -> int | None:
+    if key not in given:
+        return None
+    value = as_number(given[key])
+    if not isinstance(value, int) or not least <= value <= most:
+        shown = f"{PREFIX}{key} is {given[key]!r:.100}"
+        raise ObservationError(f"{shown}; it should be a whole number from {least} to {most}")
+    return value
+
+
+# --- batch messages ---------------------------------------------------------------------------------------------------
+# B observations in one map, and their B answers in one. Arrays have the batch axis in front, [B, …]. A text holds for
+# all rows; a list of B texts has one for each.
+
+
+def check_batch_keys(received: Mapping[str, Any], execution: bool) -> None:
+    """Raise ObservationError for a batch message with keys that a batch can't have.
+
+    execution  the server conditions plain requests on their previous chunks (--execution)
+    """
+    others = [key for key in received if key.startswith(PREFIX) and key.removeprefix(PREFIX) not in SCHEDULING_KEYS]
+    if others:
+        raise ObservationError(
+            f"{PREFIX}batch and {others[0]} were both given: a batch of observations joins no chunks and has no "
+            "session. Send such observations one by one"
+        )
+    if execution:
+        raise ObservationError(
+            f"{PREFIX}batch came to a server that joins each client's chunks (--execution): a batch joins none. Send "
+            "the observations one by one, or to a server without --execution"
+        )
+
+
+def check_batch_shapes(observations: Mapping[str, Any], batch: int, parent: str = "") -> None:
+    """Raise ObservationError unless each entry has `batch` rows, or one value for all."""
+    for key, value in observations.items():
+        name = f"{parent}{key}"
+        if isinstance(value, Mapping):
+            check_batch_shapes(value, batch, f"{name}/")
+        elif isinstance(value, np.ndarray) and value.ndim:
+            if len(value) != batch:
+                raise ObservationError(
+                    f"{name!r} has shape {list(value.shape)}, but {PREFIX}batch is {batch}: its first axis should be "
+                    f"the one of the rows, [{batch}, …]"
+                )
+        elif isinstance(value, list):
+            if not all(isinstance(item, str) for item in value):
+                raise ObservationError(
+                    f"{name!r} is a list; in a batch it should be an array [{batch}, …], a text for all rows, or a "
+                    f"list of {batch} texts"
+                )
+            if len(value) != batch:
+                raise ObservationError(f"{name!r} has {len(value)} texts, but {PREFIX}batch is {batch}")
+
+
+def batch_row(batch: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """One row's observation, or its answer. Arrays are views."""
+    return {key: _row_value(value, index) for key, value in batch.items()}
+
+
+def _row_value(value: Any, index: int) -> Any:
+    if isinstance(value, Mapping):
+        return batch_row(value, index)
+    if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim):
+        return value[index]
+    return value
+
+
+def stack_answers(answers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The rows' answers as one map: arrays of one shape as [B, …], maps by their keys, all else as lists.
+
+    Their `policy_timing` is left out: rows of one run share it.
+    """
+    keys = [key for key in answers[0] if key != TIMING and all(key in answer for answer in answers)]
+    return {key: _stack([answer[key] for answer in answers]) for key in keys}
+
+
+def _stack(values: list[Any]) -> Any:
+    if all(isinstance(value, Mapping) for value in values):
+        return stack_answers(values)
+    if all(isinstance(value, np.ndarray) for value in values) and len({value.shape for value in values}) == 1:
+        return np.stack(values)
+    return values
+
+
+def sum_timings(timings: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The times of several runs of the policy, together."""
+    return {key: sum(timing.get(key, 0.0) for timing in timings) for key in (timings[0] if timings else ())}
