@@ -5,7 +5,7 @@
     run      ClientRequest -> scheduling.schedule.Request, submitted to `Calls`; one Result an observation
     answer   results -> the map to send, or the refusal
 
-docs/dev/request.md follows one observation all the way; docs/serving.md has the keys as tables.
+docs/dev/request.md follows one observation all the way; docs/serving_sessions.md has the keys as tables.
 """
 
 import asyncio
