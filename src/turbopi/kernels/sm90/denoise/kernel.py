@@ -3,7 +3,7 @@
 Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
 the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
 shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
-units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and sizes.cu.
+units cross clusters. How: docs/dev/denoising_kernel.md and sizes.cu. Why it is safe: barriers.cu.
 
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """
@@ -36,7 +36,7 @@ FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 # Of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"; {observations}:
 # "alone" or a "pair"; {kept}: "kept" for a way back or "nothing_kept".
 PARTS = (
-    *("sizes", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
+    *("sizes", "barriers", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
     *("stream", "{form}/stream", "residual", "{kept}", "project", "feed_forward", "{times}"),
     *("{form}/project", "{form}/feed_forward", "score", "attention", "{form}/attention", "combine"),
     *("layer", "step", "{form}/step", "watch", "{form}/loop", "kernel"),
