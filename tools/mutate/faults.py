@@ -49,7 +49,7 @@ FAULTS = (
     ),
     Fault(
         "two pointers swapped in the denoising kernel's struct",
-        "turbopi.kernels.sm90.denoise",
+        "turbopi.kernels.portable.denoise",
         '"cache_k": cache_k, "cache_v": cache_v,',
         '"cache_k": cache_v, "cache_v": cache_k,',
         "queries meet values: actions are noise",
@@ -57,7 +57,7 @@ FAULTS = (
     ),
     Fault(
         "the denoising kernel's results swapped",
-        "turbopi.kernels.sm90.denoise",
+        "turbopi.kernels.portable.denoise",
         '"x_t": x_t, "v_t": v_t}',
         '"x_t": v_t, "v_t": x_t}',
         "velocities leave as actions, and memory behind v_t is overwritten",
