@@ -89,9 +89,9 @@ FAULTS = (
     ),
     Fault(
         "the denoising kernel's output projection not transposed",
-        "turbopi.kernels",
-        'small["action_out_proj.weight"].float().T.contiguous()',
-        'small["action_out_proj.weight"].float().contiguous()',
+        "turbopi.kernels.sm90",
+        'out_w=small["action_out_proj.weight"].T,',
+        'out_w=small["action_out_proj.weight"],',
         "every action is a mixture of other outputs",
         (GEOMETRY,),
     ),
