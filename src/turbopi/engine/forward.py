@@ -101,7 +101,8 @@ class VisionByOps:
         return self.ops.residual_layer_norm(stream.x, stream.pending, *norm, eps)[0]  # only a norm can add parts
 
     def project(self, stream: VisionStream, norm: Affine, projector: AffineMatrix, eps: float, out: Tensor) -> None:
-        _, normed = self.ops.residual_layer_norm(stream.x, stream.pending, *norm, eps)
+        given = input_of(projector[0])
+        _, normed = self.ops.residual_layer_norm(stream.x, stream.pending, *norm, eps, **given)
         self.ops.linear(normed, *projector, out)
 
 
