@@ -16,13 +16,16 @@ from test_gpu_vision_head import runner_of
 from turbopi.backends import Precision
 from turbopi.engine.batch import BatchBuffers, BatchSize, PackedPrefix
 from turbopi.engine.call import Pictures
+from turbopi.kernels import plain
+from turbopi.kernels.interface import VisionStream
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.kernels.sm90.gemm import bf16, fp8, products, vision_products
+from turbopi.kernels.sm90 import vision
+from turbopi.kernels.sm90.gemm import bf16, fp8, products
 from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.products import ADDING_ROWS, to_knobs
 from turbopi.kernels.sm90.gemm.tiles import RESIDUAL_TILES
-from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
 from turbopi.kernels.sm90.ops import hopper_ops
+from turbopi.kernels.sm90.vision import Deferred, FusedVision
 from turbopi.kernels.tile_table import TileKey, TileTable
 from turbopi.quantization.fp8 import Matrix, to_e4m3
 
@@ -44,7 +47,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> Ran:
 
     monkeypatch.setattr(products, "matmul", recording("bf16"))
     monkeypatch.setattr(products, "matmul_fp8", recording("fp8"))
-    for module in (products, vision_products):
+    for module in (products, vision):
         monkeypatch.setattr(module, "multiprocessors", lambda device: 132)
     return called
 
@@ -67,15 +70,9 @@ def test_a_whole_product_of_many_rows_is_added(numbers: str, operation: str, wit
     tile, bias = Tile(1, 32, overlap=True), torch.zeros(WIDTH) if with_bias else None
     for rows, into_stream in ((ADDING_ROWS, True), (ADDING_ROWS - 64, False)):
         stream, x, weight = operands(numbers, rows)
-        asked: list[int] = []
-
-        def ahead(asked: list[int] = asked) -> None:
-            asked.append(1)
-
         measured = table(operation, numbers, rows, tile)
-        assert products.added(stream, x, weight, bias, ahead, tiles=measured) == into_stream
+        assert products.added(stream, x, weight, bias, tiles=measured) == into_stream
         assert ran == [(numbers, tile, "added")] * into_stream, "few rows are left to the norm"
-        assert len(asked) == into_stream, "what comes next is counted once a product"
         ran.clear()
 
 
@@ -96,12 +93,14 @@ def test_a_tile_that_overlaps_also_makes_what_is_not_added(ran: Ran) -> None:
 
 
 def test_the_tower_adds_where_the_norm_does_not_bring_the_stream(ran: Ran) -> None:
-    tower = VisionProducts(table("partial", "bf16", ADDING_ROWS, Tile(1, 32)))
+    tower = FusedVision(plain.vision_attention, table("partial", "bf16", ADDING_ROWS, Tile(1, 32)))
     stream, x, weight = operands("bf16", ADDING_ROWS)
-    assert tower.add_linear(stream, x, weight, torch.zeros(WIDTH)) and [one[2] for one in ran] == ["added"]
+    after = tower._add(VisionStream(stream), x, (weight, torch.zeros(WIDTH)), weight)
+    assert after == VisionStream(stream) and [one[2] for one in ran] == ["added"]
     rows, width, inner = next(iter(RESIDUAL_TILES))
-    few = torch.zeros(rows, inner), torch.zeros(width, inner), torch.zeros(width)
-    assert not tower.add_linear(torch.zeros(rows, width), *few), "a product that is made when the norm brings it"
+    few = torch.zeros(rows, inner), (torch.zeros(width, inner), torch.zeros(width))
+    after = tower._add(VisionStream(torch.zeros(rows, width), sums="known"), *few, weight)
+    assert isinstance(after.pending, Deferred) and after.sums == "known" and len(ran) == 1, "it runs with the norm"
 
 
 @on_hopper

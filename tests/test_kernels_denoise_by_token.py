@@ -191,7 +191,11 @@ class OnCpu:
         sizes = denoise.kernel_sizes(arrangement, suffix=suffix, by_token=True, **SIZES)
         here = denoise.FOLDER / "denoise"
         form = "few" if suffix <= denoise.FEW else "many"
-        text = [HOST, (here / "sizes.cu").read_text(), denoise.ARGS_BY_TOKEN.source]
+        text = [
+            HOST,
+            *((here / f"{name}.cu").read_text() for name in ("sizes", "barriers")),
+            denoise.ARGS_BY_TOKEN.source,
+        ]
         text += [(here / form / "memory.cu").read_text(), CTA, (here / "token_times.cu").read_text(), ENTRIES]
         (folder / "times.cpp").write_text("\n".join(text))
         library = folder / "times.so"

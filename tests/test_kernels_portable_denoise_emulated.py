@@ -151,7 +151,7 @@ def test_blocks_that_wait_in_vain_give_up_and_say_where(monkeypatch: pytest.Monk
     steps = torch.zeros(2, *p.noise.shape), torch.zeros(1, *p.noise.shape)
     kernel.launch(*launch, *steps)
     assert kernel.why_it_trapped() is None
-    kernel._kernel.missing = 1  # type: ignore[attr-defined]
+    kernel._loop.kernel.missing = 1  # type: ignore[attr-defined]
     with pytest.raises(RuntimeError, match="a trap"):
         kernel.launch(*launch, *steps)
     assert "waited for seconds for one another behind embed in step 0" in str(kernel.why_it_trapped())

@@ -51,6 +51,14 @@ def test_norms_that_have_changed_are_noticed(tmp_path: Path) -> None:
     assert other_sources(tmp_path) != other_sources(PACKAGE)
 
 
+def test_what_a_tile_is_compiled_from_tells_its_forms_and_launch_without_a_compiler(document: TileFile) -> None:
+    one = next(one for one in document.tiles if one.operation == "plain" and isinstance(from_knobs(one.tile), Tile))
+    others = (replace(one, rows=one.rows + 6400), replace(one, tile=one.tile | {"ring": 3}))
+    found = compiled([one], compiling=False)
+    assert found == compiled([one], compiling=False)
+    assert all(compiled([other], compiling=False).popitem()[1] != found[str(one.key)] for other in others)
+
+
 @pytest.mark.skipif(compiler() is None, reason="no NVRTC here")
 def test_code_differs_by_tile_and_not_by_run(document: TileFile) -> None:
     one = next(one for one in document.tiles if one.operation == "plain" and isinstance(from_knobs(one.tile), Tile))

@@ -1,6 +1,7 @@
-"""Each product of the vision tower is told which matrix comes next, so that it is in L2 by then."""
+"""Each GEMM of the vision tower fetches the next one's matrix into L2, and no call depends on those before."""
 
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,34 +10,41 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.kernels.sm90.gemm import vision_products
-from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.engine.forward import vision_tokens
+from turbopi.kernels.interface import VisionLayer
+from turbopi.kernels.sm90 import vision
+from turbopi.kernels.sm90.gemm.bf16 import Folded, Tile
+from turbopi.kernels.sm90.norms import layer_norm
+from turbopi.kernels.sm90.vision import FusedVision
 
-WIDTH, HIDDEN, LAYERS = 16, 32, 2
-Told = list[tuple[str, str | None]]  # the matrix that was multiplied, the one that it was told of
+WIDTH, HIDDEN, LAYERS, TOKENS = 16, 32, 2, 4
+Ran = list[tuple[str, str | None]]  # the matrix that is multiplied, the one that is fetched into L2
 
 
 class Tower:
-    """Its weights, and `run`: the products of one call, without the norms between them."""
-
     def __init__(self) -> None:
         sizes = {"qkv": (3 * WIDTH, WIDTH), "out": (WIDTH, WIDTH), "fc1": (HIDDEN, WIDTH), "fc2": (WIDTH, HIDDEN)}
-        self.weights = {f"{name} {i}": torch.zeros(size) for i in range(LAYERS) for name, size in sizes.items()}
-        self.weights["projector"] = torch.zeros(WIDTH, WIDTH)
-        self.prefix = torch.zeros(WIDTH, WIDTH)
+        self.matrices = {f"{name} {i}": torch.zeros(size) for i in range(LAYERS) for name, size in sizes.items()}
+        self.matrices["projector"] = torch.zeros(WIDTH, WIDTH)
+        norm = torch.ones(WIDTH), torch.zeros(WIDTH)
+        self.weights: Any = SimpleNamespace(patch=None, position=None, post_layernorm=norm)
+        self.weights.vision = [
+            VisionLayer(norm, norm2=norm, **{name: self.affine(f"{name} {i}") for name in sizes}) for i in range(LAYERS)
+        ]
+        self.weights.projector = self.affine("projector")
 
-    def name(self, matrix: Tensor | None) -> str | None:
-        return next((name for name, weight in self.weights.items() if weight is matrix), None)
+    def affine(self, name: str) -> tuple[Tensor, Tensor]:
+        return self.matrices[name], torch.zeros(len(self.matrices[name]))
 
-    def run(self, ops: VisionProducts) -> None:
-        x, hidden = torch.zeros(4, WIDTH), torch.zeros(4, HIDDEN)
-        for i in range(LAYERS):
-            ops.linear(x, self.weights[f"qkv {i}"], torch.zeros(3 * WIDTH))
-            ops.residual_linear(x, self.weights[f"out {i}"], torch.zeros(WIDTH))
-            ops.linear_gelu(x, self.weights[f"fc1 {i}"], torch.zeros(HIDDEN))
-            ops.residual_linear(hidden, self.weights[f"fc2 {i}"], torch.zeros(WIDTH))
-        ops.linear(x, self.weights["projector"], torch.zeros(WIDTH), torch.zeros(4, WIDTH))
-        ops.linear(x, self.prefix)  # without a bias: not the tower's
+    def name(self, matrix: Tensor | Folded | None) -> str | None:
+        if isinstance(matrix, Folded):
+            matrix = matrix.data
+        return next((name for name, one in self.matrices.items() if one is matrix), None)
+
+    def run(self, ops: Any, *images: int) -> None:
+        config: Any = SimpleNamespace(vision=SimpleNamespace(layer_norm_eps=1e-6, num_tokens=TOKENS, num_heads=2))
+        parts = [lambda n=n: torch.zeros(n * TOKENS, WIDTH) for n in images]
+        vision_tokens(config, self.weights, ops, parts, torch.zeros(sum(images) * TOKENS, WIDTH))
 
 
 @pytest.fixture
@@ -45,38 +53,67 @@ def tower() -> Tower:
 
 
 @pytest.fixture
-def told(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Told:
-    """What the products are told, as they are called; nothing is multiplied."""
-    told: Told = []
+def ran(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Ran:
+    """The GEMMs as they run; nothing is multiplied."""
+    ran: Ran = []
 
-    def product(x: Tensor, weight: Tensor, *rest: Any, **more: Any) -> Tensor:
-        if weight is tower.prefix:
-            assert rest[-1] is None
-        else:
-            told.append((str(tower.name(weight)), tower.name(rest[-1])))
-        return x
+    def tuned(x: Tensor, weight: Tensor, bias: Tensor, *rest: Any, **more: Any) -> Tensor:
+        ran.append((str(tower.name(weight)), tower.name(rest[-1])))
+        return x.new_zeros(len(x), len(weight))
+
+    def gemm(x: Tensor, weight: Any, *rest: Any, ahead: Tensor | None, **more: Any) -> Tensor:
+        ran.append((str(tower.name(weight)), tower.name(ahead)))
+        return x.new_zeros(len(x), len(weight.data))
 
     for name in ("tuned_linear", "tuned_residual_linear", "tuned_linear_gelu"):
-        monkeypatch.setattr(vision_products, name, product)
-    monkeypatch.setattr(vision_products, "multiprocessors", lambda device: 132)
-    return told
+        monkeypatch.setattr(vision, name, tuned)
+    monkeypatch.setattr(vision, "matmul", gemm)
+    monkeypatch.setattr(vision, "multiprocessors", lambda device: 132)
+    monkeypatch.setattr(layer_norm, "residual_layer_norm", lambda x, y, *norm: (x, x))
+    return ran
 
 
-def test_from_the_second_call_on_each_product_is_told_of_the_next_ones_matrix(tower: Tower, told: Told) -> None:
-    ops, order = VisionProducts(), list(tower.weights)
-    tower.run(ops)
-    assert told == [(name, None) for name in order]
-    told.clear()
-    tower.run(ops)
-    assert told == [*itertools.pairwise(order), ("projector", None)]
+def ops() -> Any:
+    def attention(qkv: Tensor, images: int, heads: int) -> Tensor:
+        return qkv[:, :WIDTH]
+
+    return SimpleNamespace(embed_patches=lambda x, *rest: x, vision=FusedVision(attention))
 
 
-def test_what_is_told_goes_by_the_order_of_the_call_before(tower: Tower, told: Told) -> None:
-    ops = VisionProducts()
-    tower.run(ops)
-    first = tower.weights["fc1 0"]
-    ops.linear_gelu(torch.zeros(4, WIDTH), first, torch.zeros(HIDDEN))
-    ops.linear_gelu(torch.zeros(4, WIDTH), tower.weights["fc1 1"], torch.zeros(HIDDEN))
-    told.clear()
-    ops.linear_gelu(torch.zeros(4, WIDTH), first, torch.zeros(HIDDEN))
-    assert told == [("fc1 0", "fc1 1")]
+@pytest.fixture
+def fused(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each GEMM in front of a norm adds the stream, each behind one normalises its input."""
+    monkeypatch.setattr(vision, "bf16_tile", lambda *given: Tile(1, 32))
+
+    def fold(weight: Tensor, *given: Tensor) -> Folded:
+        return Folded(weight, *given[:2])
+
+    monkeypatch.setattr(Folded, "fold", fold)
+
+
+def expected(tower: Tower) -> Ran:
+    order = list(tower.matrices)
+    return [*itertools.pairwise(order), ("projector", None)]
+
+
+def test_each_matmul_fetches_the_next_ones_matrix(tower: Tower, ran: Ran) -> None:
+    tower.run(ops(), 1)
+    assert ran == expected(tower)
+
+
+@pytest.mark.usefixtures("fused")
+def test_so_it_is_where_matmuls_are_deferred_until_the_norm(tower: Tower, ran: Ran) -> None:
+    tower.run(ops(), 1)
+    assert ran == expected(tower)
+
+
+@pytest.mark.usefixtures("fused")
+def test_what_a_call_does_does_not_depend_on_the_calls_before(tower: Tower, ran: Ran) -> None:
+    used = ops()
+    for images in ((1,), (1, 2), (1,)):
+        tower.run(used, *images)
+        before = list(ran)
+        ran.clear()
+        tower.run(ops(), *images)
+        assert ran == before
+        ran.clear()

@@ -3,10 +3,12 @@
     PYTHONPATH=src:tools python -m carry_tiles REVISION [--check]
 
 The files in src/turbopi/data/tiles say with which source their tiles were measured, and of another none is used. But
-most changes leave most kernels alone. This compiles each tile of Hopper's products as it is at REVISION, whose source
-the files name, and as it is here. A tile of the same machine code in all its forms, launched in the same way, is kept
-under today's source; another is taken out and named: `turbopi tune --only-missing` measures it again. A GPU isn't
-needed, NVRTC is. Of new candidates it knows nothing: take the rows out for which there are some.
+most changes leave most kernels alone. This compares each tile of Hopper's GEMMs as it is at REVISION, whose source the
+files name, with what it is here: the CUDA source and constants of all its forms, and how they are launched; where these
+differ, the machine code that they compile to. A tile of the same code, launched in the same way, is kept under today's
+source; another is taken out and named: `turbopi tune --only-missing` measures it again. A GPU isn't needed, NVRTC is
+where sources differ. Of new candidates it knows nothing: take the rows out for which there are some. The Triton kernels
+around the GEMMs aren't compiled: where the code of their files has changed, nothing is kept.
 With --check the files stay as they are; exit code 1 if a tile would be taken out.
 """
 
@@ -22,7 +24,9 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replace_tile
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -66,9 +70,9 @@ def epilogues(one: TunedTile, tile: Tile) -> list[Epilogue]:
     return ["plain", "added"] if tile.overlap and found[0] == "parts" else found
 
 
-def machine_code(one: TunedTile) -> str:
-    """A hash of the machine code of all forms and of how they are launched; of the library's tiles, which have none
-    here, the same for all.
+def machine_code(one: TunedTile, *, compiling: bool = True) -> str:
+    """A hash of the machine code of all forms and of how they are launched, or unless `compiling` of what they are
+    compiled from; of the library's tiles, which have none here, the same for all.
     """
     tile, digest = from_knobs(one.tile), hashlib.sha256()
     if isinstance(tile, Tile):
@@ -77,15 +81,17 @@ def machine_code(one: TunedTile) -> str:
         launched = bf16.layout(tile, epilogues(one, tile)[-1], one.rows, one.columns, steps, None, None)
         digest.update(repr((launched, bf16.clusters(tile, math.prod(launched[1]), 1 << 20))).encode())
         for source, constants in forms(one, tile):
-            digest.update(nvrtc.compile_cubin(source, ARCH, constants))
+            of_form = nvrtc.compile_cubin(source, ARCH, constants) if compiling else repr((source, constants)).encode()
+            digest.update(of_form)
     return digest.hexdigest()[:16]
 
 
-def compiled(tiles: list[TunedTile]) -> dict[str, str]:
-    """{a tile's key: its machine code} of Hopper's products."""
+def compiled(tiles: list[TunedTile], *, compiling: bool = True) -> dict[str, str]:
+    """{a tile's key: its `machine_code`} of Hopper's GEMMs."""
+    code = partial(machine_code, compiling=compiling)
     products = [one for one in tiles if one.kernels == "hopper"]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return {str(one.key): code for one, code in zip(products, pool.map(machine_code, products), strict=True)}
+        return {str(one.key): code for one, code in zip(products, pool.map(code, products), strict=True)}
 
 
 def other_sources(package: Path) -> dict[str, str]:
@@ -106,10 +112,18 @@ def main() -> int:
     parser.add_argument("revision", help="whose source the tiles were measured with, as git names it")
     parser.add_argument("--check", action="store_true", help="change no file")
     parser.add_argument("--codes", type=Path, help=argparse.SUPPRESS)  # of this file's tiles, for the other revision
+    parser.add_argument("--sources", action="store_true", help=argparse.SUPPRESS)  # what they are compiled from
     arguments = parser.parse_args()
     if arguments.codes is not None:
         document = read_document(arguments.codes, TileFile, ConfigError)
-        print(json.dumps({"fingerprint": fingerprint("hopper"), "codes": compiled(document.tiles)}))
+        print(
+            json.dumps(
+                {
+                    "fingerprint": fingerprint("hopper"),
+                    "codes": compiled(document.tiles, compiling=not arguments.sources),
+                }
+            )
+        )
         return 0
     with tempfile.TemporaryDirectory() as folder:
         old = source_at(arguments.revision, Path(folder))
@@ -128,17 +142,26 @@ def source_at(revision: str, folder: Path) -> Path:
 
 def carry(file: Path, old: Path, revision: str, check: bool) -> int:
     """One file, measured with the source in `old`. Returns the exit code."""
-    command = [sys.executable, "-m", "carry_tiles", revision, "--codes", str(file)]
     paths = os.pathsep.join((str(old), str(Path(__file__).parent)))
-    answer = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, check=True, stdout=subprocess.PIPE)
-    before, document = json.loads(answer.stdout), read_document(file, TileFile, ConfigError)
+
+    def at_revision(*options: str) -> Any:
+        command = [sys.executable, "-m", "carry_tiles", revision, "--codes", str(file), *options]
+        answer = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, check=True, stdout=subprocess.PIPE)
+        return json.loads(answer.stdout)
+
+    before, document = at_revision("--sources"), read_document(file, TileFile, ConfigError)
     if document.fingerprints.get("hopper") != before["fingerprint"]:
         print(f"{file.name}: its tiles were measured with another source than {revision}'s")
         return 1
-    new, gone = carried(document, before["codes"], compiled(document.tiles))
+    codes, now = before["codes"], compiled(document.tiles, compiling=False)
+    same = codes == now
+    if not same:
+        codes, now = at_revision()["codes"], compiled(document.tiles)
+    new, gone = carried(document, codes, now)
     for one in gone:
         print(f"{file.name}: {one.name}, {one.rows} rows, {one.numbers} has other machine code")
-    print(f"{file.name}: {len(new.tiles)} tiles kept, {len(gone)} taken out")
+    how = "compiled from the same source" if same else "of the same machine code"
+    print(f"{file.name}: {len(new.tiles)} tiles kept, {how}; {len(gone)} taken out")
     if not check:
         write_tile_file(new, file)
     return int(check and bool(gone))

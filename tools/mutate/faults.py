@@ -15,6 +15,7 @@ GEOMETRY = "tests/test_launch_geometry.py"
 BY_TOKEN = "tests/test_kernels_denoise_by_token.py"
 CONDITIONED_BATCH = "tests/test_engine_batch_conditioned.py"
 ENGINE = "tests/test_engine.py::test_equals_the_reference_for_odd_prompts_and_cameras"
+BARRIERS = "tests/test_kernels_barriers.py"
 PARITY = "tests/test_model_parity.py::test_float32_equals_openpi_within_float32_rounding"
 
 
@@ -48,7 +49,7 @@ FAULTS = (
     ),
     Fault(
         "two pointers swapped in the denoising kernel's struct",
-        "turbopi.kernels.sm90.denoise",
+        "turbopi.kernels.portable.denoise",
         '"cache_k": cache_k, "cache_v": cache_v,',
         '"cache_k": cache_v, "cache_v": cache_k,',
         "queries meet values: actions are noise",
@@ -56,7 +57,7 @@ FAULTS = (
     ),
     Fault(
         "the denoising kernel's results swapped",
-        "turbopi.kernels.sm90.denoise",
+        "turbopi.kernels.portable.denoise",
         '"x_t": x_t, "v_t": v_t}',
         '"x_t": v_t, "v_t": x_t}',
         "velocities leave as actions, and memory behind v_t is overwritten",
@@ -88,9 +89,9 @@ FAULTS = (
     ),
     Fault(
         "the denoising kernel's output projection not transposed",
-        "turbopi.kernels",
-        'small["action_out_proj.weight"].float().T.contiguous()',
-        'small["action_out_proj.weight"].float().contiguous()',
+        "turbopi.kernels.sm90",
+        'out_w=small["action_out_proj.weight"].T,',
+        'out_w=small["action_out_proj.weight"],',
         "every action is a mixture of other outputs",
         (GEOMETRY,),
     ),
@@ -309,6 +310,30 @@ FAULTS = (
         "await_products<2>();  // the round before is done",
         "weights are overwritten while they are multiplied: wrong now and then",
         (PRODUCTS,),
+    ),
+    Fault(
+        "a slot is given back when 15 of 16 warps have read it",
+        "turbopi.kernels.sm90",
+        "barrier_init(b.empty(i), W);",
+        "barrier_init(b.empty(i), W - 1);",
+        "weights are overwritten while a warp reads them: wrong now and then, or the loop stops",
+        (BARRIERS,),
+    ),
+    Fault(
+        "queries are sent before all ranks have multiplied the stream",
+        "turbopi.kernels.sm90",
+        "    await_room(b);\n    send_queries(b, staged);",
+        "    send_queries(b, staged);",
+        "queries land on the stream while a rank multiplies it: wrong now and then",
+        (BARRIERS,),
+    ),
+    Fault(
+        "fewer bytes of queries are awaited than are sent",
+        "turbopi.kernels.sm90",
+        "Q_EXPECT = HD * T * 2",
+        "Q_EXPECT = HD * T",
+        "scores of half of the queries; then the barrier is never right again",
+        (BARRIERS,),
     ),
     Fault(
         "every observation of a batch told what the first one asks for",

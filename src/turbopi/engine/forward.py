@@ -15,6 +15,7 @@ Shapes: V cameras, S prefix slots of the bucket, H suffix tokens, D width, K hea
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -23,17 +24,16 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import GemmaLayer, Ops, State, VisionLayer
+from turbopi.kernels.interface import Affine, AffineMatrix, GemmaLayer, Ops, State, VisionLayer, VisionStream
 from turbopi.models import family_of
 from turbopi.models.pi0.layers import rope_tables
-from turbopi.quantization.fp8 import input_of
+from turbopi.quantization.fp8 import Matrix, input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]
 Stream = tuple[Tensor, Tensor | None, Tensor | None]  # residual stream, what is to be added to it, times which gate
 # a layer's number and its queries [tokens * n, K], of the expert its product q|k|v [T, (n + 2) * K] -> [tokens, n * K]
 Attend = Callable[..., Tensor]
 Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its keys and values go, each [tokens, K]
-VisionStream = tuple[Tensor, Any]  # residual stream [V * 256, W], and what the next norm is to add to it
 
 HEAD_LAYERS = 3  # of vision: what they take is about as long as the host takes to launch the other 24
 # Of the prefix, which go through the products and norms between two attentions together. The activations of more don't
@@ -55,38 +55,56 @@ def vision_tokens(
                has ended. A head is patch embedding and the first layers; the others are of all pictures together
     head_ends  is called behind each head: see `engine.graph.HEAD`
     """
-    eps, several = config.vision.layer_norm_eps, len(parts) > 1
-    head = weights.vision[:HEAD_LAYERS]
-    rest, ends = weights.vision[len(head) :], []
+    v, several, vision = config.vision, len(parts) > 1, ops.vision or VisionByOps(ops)
+    eps, following = v.layer_norm_eps, [*(layer.qkv[0] for layer in weights.vision[1:]), weights.projector[0]]
+    layers = list(zip(weights.vision, following, strict=True))
+    head, rest, ends = layers[:HEAD_LAYERS], layers[HEAD_LAYERS:], []
     for bring in parts:
-        x = ops.embed_patches(bring(), weights.patch, weights.position, out.dtype)  # [pictures * 256, W]
-        y = None
-        for layer in head:
-            x, y = _vision_layer(config, ops, layer, x, y)
-        if several and y is not None:  # only a norm can add it, whatever it is; what is normed isn't needed yet
-            x, _ = ops.residual_layer_norm(x, y, *(rest[0].norm1 if rest else weights.post_layernorm), eps)
+        # [images * 256, W]
+        stream = VisionStream(ops.embed_patches(bring(), weights.patch, weights.position, out.dtype))
+        for layer, behind in head:
+            images = len(stream.x) // v.num_tokens
+            stream = vision.layer(layer, stream, images=images, heads=v.num_heads, eps=eps, following=behind)
         if several:
-            ends.append(x)
+            ends.append(vision.finish(stream, rest[0][0].norm1 if rest else weights.post_layernorm, eps))
         if rest or several:
             head_ends()
     if several:
-        x, y = torch.cat(ends), None  # [V * 256, W]
+        stream = VisionStream(torch.cat(ends))  # [V * 256, W]
         ends.clear()
-    for layer in rest:
-        x, y = _vision_layer(config, ops, layer, x, y)
-    _, normed = ops.residual_layer_norm(x, y, *weights.post_layernorm, eps)
-    ops.linear(normed, *weights.projector, out)
+    for layer, behind in rest:
+        images = len(stream.x) // v.num_tokens
+        stream = vision.layer(layer, stream, images=images, heads=v.num_heads, eps=eps, following=behind)
+    vision.project(stream, weights.post_layernorm, weights.projector, eps, out)
 
 
-def _vision_layer(config: ModelConfig, ops: Ops, layer: VisionLayer, x: Tensor, y: Any) -> VisionStream:
-    v = config.vision
-    x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
-    qkv = ops.linear(normed, *layer.qkv)
-    attended = ops.vision_attention(qkv, len(x) // v.num_tokens, v.num_heads, **input_of(layer.out[0], x))
-    y = _added(ops, x, attended, *layer.out)
-    x, normed = ops.residual_layer_norm(x, y, *layer.norm2, v.layer_norm_eps, **input_of(layer.fc1[0]))
-    hidden = ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0], x))
-    return x, _added(ops, x, hidden, *layer.fc2)
+@dataclass(frozen=True)
+class VisionByOps:
+    """The vision tower by an operation a step: `pending` is a matmul's result, or None where it was added in place."""
+
+    ops: Ops
+
+    def layer(
+        self, layer: VisionLayer, stream: VisionStream, *, images: int, heads: int, eps: float, following: Matrix
+    ) -> VisionStream:
+        ops = self.ops
+        x, normed = ops.residual_layer_norm(stream.x, stream.pending, *layer.norm1, eps, **input_of(layer.qkv[0]))
+        qkv = ops.linear(normed, *layer.qkv)
+        attended = ops.vision_attention(qkv, images, heads, **input_of(layer.out[0], x))
+        y = _added(ops, x, attended, *layer.out)
+        x, normed = ops.residual_layer_norm(x, y, *layer.norm2, eps, **input_of(layer.fc1[0]))
+        hidden = ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0], x))
+        return VisionStream(x, _added(ops, x, hidden, *layer.fc2))
+
+    def finish(self, stream: VisionStream, norm: Affine, eps: float) -> Tensor:
+        if stream.pending is None:
+            return stream.x
+        return self.ops.residual_layer_norm(stream.x, stream.pending, *norm, eps)[0]  # only a norm can add parts
+
+    def project(self, stream: VisionStream, norm: Affine, projector: AffineMatrix, eps: float, out: Tensor) -> None:
+        given = input_of(projector[0])
+        _, normed = self.ops.residual_layer_norm(stream.x, stream.pending, *norm, eps, **given)
+        self.ops.linear(normed, *projector, out)
 
 
 def _added(ops: Ops, stream: Tensor | None, x: Tensor, *affine: Any) -> Any:

@@ -53,6 +53,37 @@ class VisionLayer:
 
 
 @dataclass(frozen=True)
+class VisionStream:
+    """The vision tower's residual stream, and what is known of it or still to be added to it.
+
+    pending  what the next norm adds: None, a matmul's result or its parts, or a matmul that is still to run
+    sums     of x's rows, from the matmul that made x; None: not known
+    """
+
+    x: Tensor  # [V * 256, W]
+    pending: Any = None
+    sums: Any = None
+
+
+class VisionOps(Protocol):
+    """The vision tower by layers: for kernels that put norms and the residual stream into their matmuls.
+
+    `pending` and `sums` of a stream are the implementation's own: only it may read them.
+    """
+
+    def layer(
+        self, layer: VisionLayer, stream: VisionStream, *, images: int, heads: int, eps: float, following: Matrix
+    ) -> VisionStream:
+        """One layer. following: the matrix that is multiplied behind it."""
+
+    def finish(self, stream: VisionStream, norm: Affine, eps: float) -> Tensor:
+        """The residual stream with all that was pending. norm: the one behind it, whose result isn't needed yet."""
+
+    def project(self, stream: VisionStream, norm: Affine, projector: AffineMatrix, eps: float, out: Tensor) -> None:
+        """The last norm and the projector, into `out` [V * 256, D]."""
+
+
+@dataclass(frozen=True)
 class GemmaLayer(Generic[AnyMatrix]):
     """One layer of either stack. The norms are float32[D], 1 + scale; None where adaRMS replaces them."""
 
@@ -87,6 +118,7 @@ class Ops:
     # adds a product to the residual stream, its first argument, in place; further arguments as of `residual_linear`.
     # Returns whether it did: where it didn't, `residual_linear` is the faster way
     add_linear: Callable[..., bool] | None = None
+    vision: VisionOps | None = None  # None: `forward.VisionByOps` of these operations
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     # by the expert's sizes, the number of its tokens, and whether keys are hidden from some of them (`Expert.hidden`);

@@ -20,15 +20,16 @@ from turbopi.kernels.sm90.gemm import products
 from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
-from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
 from turbopi.kernels.sm90.norms import layer_norm
+from turbopi.kernels.sm90.vision import FusedVision
 from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     """With these measured tiles, and in sizes that they don't have those of gemm/tiles.py."""
-    portable, vision, batch = portable_ops(tiles), VisionProducts(tiles), portable_batch.batch_ops(tiles)
+    portable, batch = portable_ops(tiles), portable_batch.batch_ops(tiles)
+    attention_of_images = partial(vision_attention, tiles=tiles)
     origin = {
         "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
@@ -45,13 +46,14 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     origin["LayerNorm"] = norms
     return replace(
         portable,
-        residual_layer_norm=vision.residual_layer_norm,
-        linear=vision.linear,
-        residual_linear=vision.residual_linear,
-        add_linear=vision.add_linear,
-        linear_gelu=vision.linear_gelu,
+        residual_layer_norm=layer_norm.residual_layer_norm,
+        linear=partial(products.tuned_linear, tiles=tiles),
+        residual_linear=partial(products.tuned_residual_linear, tiles=tiles),
+        add_linear=partial(products.added, tiles=tiles),
+        linear_gelu=partial(products.tuned_linear_gelu, tiles=tiles),
         linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
-        vision_attention=partial(vision_attention, tiles=tiles),
+        vision_attention=attention_of_images,
+        vision=FusedVision(attention_of_images, tiles),
         attention=partial(attend, tiles=tiles),
         backward=vjp.way_back,
         batch=replace(

@@ -1,4 +1,40 @@
 // The loop over steps and layers.
+//
+// Every barrier: tests/test_kernels_barriers.py reads these tables and the code, and fails where they differ.
+//
+// The grid's barrier (`Grid` in primitives.cu) is one counter: each of BLOCKS blocks arrives once behind a phase, and goes on
+// when all have. What stands between `arrive` and `wait` depends on no other block. `product.run` and `attend` wait inside,
+// when they have asked for weights, or keys.
+//
+// in a step, in this order: what the phase does, and what its wait protects
+//
+// embed: embed; arrive
+//   guards   x_t, which the end of the step before waits for; the stream and its squares, which gate|up has read
+// qkv: product.run; arrive
+//   guards   stream and squares, of embed or down
+// attention: attend; arrive
+//   guards   queries, keys, values
+// combine: wait; combine; arrive
+//   guards   partial, tops
+// out: product.run; arrive
+//   guards   attended; the stream, which q|k|v has read
+// gate_up: product.run; arrive
+//   guards   stream and squares, of out
+// down: product.run; arrive
+//   guards   hidden; the stream, which gate|up has read
+// advance: wait; advance; arrive; wait
+//   guards   x and squares, of the last layer's down; then x_t
+//
+// of a block's warps (__syncthreads): how often in which function
+//
+// Grid::arrive: 1
+//   guards   all warps' stores, before thread 0 releases them
+// Grid::wait: 1
+//   guards   no warp reads before thread 0 has seen all arrivals
+// Product::run: 2
+//   guards   sums in S_WORK: read before the next pass writes; written before they are added up, and S_RMS with them
+// attend: 5
+//   guards   S_QUERIES; logits; S_WEIGHTS; S_OUT; all of them, before the next share
 
 // action_in_proj of x_t, and the stream of the first norm: each block the columns that it keeps.
 __device__ __forceinline__ void embed(const Args& args, const Stream& into, const float* x_t) {

@@ -8,17 +8,24 @@ Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns,
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.kernels.arguments import Parameter, Struct
-from turbopi.kernels.interface import State, TokenInputs
+from turbopi.kernels.interface import State
 from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
-from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
+from turbopi.kernels.portable.denoise.host import (
+    OF_LAUNCH,
+    CooperativeDenoiser,
+    Launched,
+    check_covered,
+    end_tensors,
+    ends,
+    model_sizes,
+)
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
-from turbopi.support.errors import BackendError, BackendUnavailable
+from turbopi.support.errors import BackendUnavailable
 
 PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
 MAX_SUFFIX = 64
@@ -72,17 +79,8 @@ ARGS = Struct(
         Parameter("const float*", "shifted", "[N][L][channels of qkv, gate|up]: W shift"),
         Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8, INT8"),
         Parameter("const float*", "attended_times", "[L]: FP8"),
-        Parameter("const float*", "out_w", "[A][D]"),
-        Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
-        Parameter("const float*", "in_w", "[A][D]"),
-        Parameter("const float*", "in_b", "[D]"),
-        Parameter("const float*", "inv_freq", "[K/2]"),
-        Parameter("const unsigned char*", "cache_k", "bf16 [L][rows][K], layer_stride bytes from layer to layer"),
-        Parameter("const unsigned char*", "cache_v"),
-        Parameter("const long long*", "length", "valid rows of the cache"),
-        Parameter("const float*", "noise", "[T][A]"),
-        Parameter("float*", "x_t", "[N+1][T][A]"),
-        Parameter("float*", "v_t", "[N][T][A]"),
+        *ends("[A][D]"),
+        *OF_LAUNCH,
         Parameter("float*", "x", "[T][D] the residual stream"),
         Parameter("float*", "squares", "[T][D/8] of x, added up by tiles"),
         Parameter("unsigned char*", "stream", "[chunk][T][columns of a chunk] x times a norm's scale; zeros beyond D"),
@@ -116,13 +114,7 @@ def kernel_sizes(
     key_tiles = -(-keys // 8)
     split_keys = -(-key_tiles // splits) * 8
     return {
-        "TP_WIDTH": g.width,
-        "TP_MLP_DIM": g.mlp_dim,
-        "TP_DEPTH": g.depth,
-        "TP_HEADS": g.num_heads,
-        "TP_HEAD_DIM": g.head_dim,
-        "TP_TOKENS": suffix,
-        "TP_ACTION_DIM": config.action_dim,
+        **model_sizes(config, suffix),
         "TP_BLOCKS": blocks,
         "TP_WARPS": choice.warps,
         "TP_SUMS": max(choice.sums, -(-suffix // 16)),
@@ -150,7 +142,7 @@ def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) ->
     return compile_for(source(), arch, sizes, folder=folder)
 
 
-class PortableDenoiser:
+class PortableDenoiser(CooperativeDenoiser):
     """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
 
     `table` float32[N, 2L + 1, 3, D] is the modulation (`engine.weights.modulation`), `small` holds action_in_proj and
@@ -182,69 +174,33 @@ class PortableDenoiser:
         if by_token or num_steps is not None:
             raise BackendUnavailable("the portable denoising kernel has no times by token")
         reason = unavailable(device, packed.numbers)
-        if reason is not None:
-            raise BackendUnavailable(reason)
-        if not 1 <= suffix <= MAX_SUFFIX:
-            raise BackendError(f"the portable denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
-        self._config, self._suffix, self._choice = config, suffix, choice or choices(suffix)
-        self._blocks = blocks or multiprocessors(device)
+        check_covered("the portable denoising kernel", reason, suffix, MAX_SUFFIX)
+        choice, blocks = choice or choices(suffix), blocks or multiprocessors(device)
         if not has_large_l2(device):
-            self._choice = replace(self._choice, ahead=False)
-        self._sizes = kernel_sizes(
+            choice = replace(choice, ahead=False)
+        sizes = kernel_sizes(
+            config, blocks=blocks, cache_rows=cache_rows, suffix=suffix, weights=packed.numbers, choice=choice
+        )
+        sizes["TP_TRACE"] = int(traced)
+        loop, prepare = load(device, sizes, arch)
+        prepared = suffix * max(config.expert.head_dim // 2, config.action_dim)
+        super().__init__(
             config,
-            blocks=self._blocks,
-            cache_rows=cache_rows,
+            steps=len(table),
             suffix=suffix,
-            weights=packed.numbers,
-            choice=self._choice,
+            arguments=ARGS,
+            tensors=tensors(packed, small, table.to(device).float().contiguous(), sizes),
+            numbers={"logit_scale": config.expert.head_dim**-0.5},
+            prepare=Launched(prepare, -(-prepared // PREPARE_THREADS), PREPARE_THREADS),
+            loop=Launched(loop, blocks, choice.warps * 32),
         )
-        self._sizes["TP_TRACE"] = int(traced)
-        self._kernel, self._prepare = load(device, self._sizes, arch)
-        self._steps = len(table)
-        self._tensors = tensors(packed, small, table.to(device).float().contiguous(), self._sizes)
-
-    def launch(
-        self,
-        noise: Tensor,
-        cache_k: Tensor,
-        cache_v: Tensor,
-        length: Tensor,
-        x_t: Tensor,
-        v_t: Tensor,
-        tokens: TokenInputs | None = None,
-    ) -> None:
-        """Denoise on the current stream.
-
-        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
-        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A].
-        """
-        steps, g = self._steps, self._config.expert
-        assert tokens is None, "this kernel has no times by token"
-        chunk = (steps, self._suffix, self._config.action_dim)
-        assert length.dtype == torch.int64, length.dtype
-        check_launch(noise, cache_k, cache_v, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
-        named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
-        pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
-        args = ARGS.value(
-            {
-                **pointers,
-                "layer_stride": cache_k.stride(0) * 2,
-                "steps": steps,
-                "dt": float(np.float32(-1.0 / steps)),
-                "eps": self._config.rms_norm_eps,
-                "logit_scale": g.head_dim**-0.5,
-            }
-        )
-        prepared = max(self._suffix * g.head_dim // 2, noise.numel())
-        self._prepare.launch(-(-prepared // PREPARE_THREADS), PREPARE_THREADS, args)
-        self._kernel.launch_cooperative(self._blocks, self._choice.warps * 32, args)
 
     def clock_mhz(self) -> None:
         """This kernel doesn't measure it."""
 
     def why_it_trapped(self) -> str | None:
         """After a launch that failed: where a block waited for seconds before it gave up, or None."""
-        return stuck(int(self._tensors["hang"]) // self._blocks, self._config.expert.depth)
+        return stuck(int(self._tensors["hang"]) // self._loop.blocks, self._config.expert.depth)
 
     def trace(self) -> Tensor:  # of a kernel that was made with `traced`
         """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it."""
@@ -297,11 +253,11 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
         "shifted": made.shifted,
         "row_scales": made.row_scales,
         "attended_times": made.attended_times,
-        "out_w": small["action_out_proj.weight"].float().contiguous(),
-        "out_shift": affine(small, "action_out_proj", table[:, -1, 1].double()).float().contiguous(),
-        "in_w": small["action_in_proj.weight"].float().T.contiguous(),
-        "in_b": small["action_in_proj.bias"].float().contiguous(),
-        "inv_freq": inverse_frequencies(packed.config, device),
+        **end_tensors(
+            *(packed.config, small, table),
+            out_w=small["action_out_proj.weight"],
+            in_w=small["action_in_proj.weight"].T,
+        ),
         "x": scratch(suffix, g.width),
         "squares": scratch(suffix, g.width // 8),
         "stream": activation(g.width),

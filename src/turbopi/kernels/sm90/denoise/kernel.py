@@ -3,15 +3,13 @@
 Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
 the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
 shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
-units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and sizes.cu.
+units cross clusters. How: docs/dev/denoising_kernel.md and sizes.cu. Why it is safe: barriers.cu.
 
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +17,15 @@ from turbopi.config import ModelConfig
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
 from turbopi.kernels.interface import KeptStep, State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
-from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
+from turbopi.kernels.portable.denoise.host import (
+    OF_LAUNCH,
+    CooperativeDenoiser,
+    Launched,
+    check_covered,
+    end_tensors,
+    ends,
+    model_sizes,
+)
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.denoise.packing import (
     BLOCK,
@@ -36,7 +42,7 @@ FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 # Of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"; {observations}:
 # "alone" or a "pair"; {kept}: "kept" for a way back or "nothing_kept".
 PARTS = (
-    *("sizes", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
+    *("sizes", "barriers", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
     *("stream", "{form}/stream", "residual", "{kept}", "project", "feed_forward", "{times}"),
     *("{form}/project", "{form}/feed_forward", "score", "attention", "{form}/attention", "combine"),
     *("layer", "step", "{form}/step", "watch", "{form}/loop", "kernel"),
@@ -107,18 +113,9 @@ ARGS = Struct(
         Parameter("const long long*", "starts", "[NC * S]: where a CTA's begin in a layer, bytes"),
         Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
         Parameter("const float*", "shifted", "[N][L][NC * S][TILES][16]: W shift"),
-        Parameter("const float*", "out_w", "[D][A]"),
-        Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
-        Parameter("const float*", "in_w", "[D][A]"),
-        Parameter("const float*", "in_b", "[D]"),
-        Parameter("const float*", "inv_freq", "[HD/2]"),
-        Parameter("const unsigned char*", "cache_k", "bf16 [L][rows][HD], layer_stride bytes from layer to layer"),
-        Parameter("const unsigned char*", "cache_v"),
+        *ends("[D][A]"),
         Parameter("unsigned char*", "keys", "bf16 [L][2][KEY_TILES][QT] fragments: the cache as tensor cores take it"),
-        Parameter("const long long*", "length", "valid rows of the cache"),
-        Parameter("const float*", "noise", "[T][A]"),
-        Parameter("float*", "x_t", "[N+1][T][A]"),
-        Parameter("float*", "v_t", "[N][T][A]"),
+        *OF_LAUNCH,
         Parameter("uint4*", "scratch", "zero at the start"),
         Parameter("u32*", "hang", "[NC * S] host memory: see `watch`"),
         Parameter("long long*", "clock", "[2] host memory: cycles and nanoseconds of a launch, of CTA 0"),
@@ -171,6 +168,11 @@ ARGS_KEEPING = Struct(
 )
 
 
+def arguments(by_token: bool, pair: bool, keep: bool) -> Struct:
+    """What a form of the kernel takes."""
+    return ARGS_KEEPING if keep else ARGS_BY_TOKEN if by_token else ARGS_OF_PAIR if pair else ARGS
+
+
 def kernel_sizes(
     arrangement: Arrangement,
     *,
@@ -198,13 +200,7 @@ def kernel_sizes(
         head, hidden = g.head_dim // BLOCK, most(g.mlp_dim // BLOCK, arrangement.clusters)
         scratch += arrangement.clusters * groups * (head * (16 + words) + hidden * words)
     return {
-        "TP_WIDTH": g.width,
-        "TP_MLP_DIM": g.mlp_dim,
-        "TP_DEPTH": g.depth,
-        "TP_HEADS": g.num_heads,
-        "TP_HEAD_DIM": g.head_dim,
-        "TP_TOKENS": suffix,
-        "TP_ACTION_DIM": config.action_dim,
+        **model_sizes(config, suffix),
         "TP_RANKS": RANKS,
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
@@ -227,7 +223,7 @@ def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False, k
         instructions.wgmma("add_rows", columns, from_registers=True),
         instructions.wgmma("add_keys", 2 * 8),
     )
-    args = ARGS_KEEPING if keep else ARGS_BY_TOKEN if by_token else ARGS_OF_PAIR if pair else ARGS
+    args = arguments(by_token, pair, keep)
     generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), args.source)
     which = {
         "form": "few" if suffix <= FEW else "many",
@@ -291,7 +287,7 @@ def _room_to_keep(config: ModelConfig, suffix: int, device: torch.device) -> tup
     return kept, {name: torch.zeros(*shape, device=device) for name, shape in shapes.items()}
 
 
-class DenoiseKernel:
+class DenoiseKernel(CooperativeDenoiser):
     """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
 
     `table` float32[N, 2L + 1, 3, D] is the modulation (`engine.weights.modulation`), `small` holds action_in_proj and
@@ -323,23 +319,17 @@ class DenoiseKernel:
         assert by_token == (num_steps is not None), "by token the table doesn't tell the number of steps"
         assert not (pair and by_token), "two observations have one time"
         assert not by_token or len(table) <= MAX_ROWS, len(table)
-        reason = unavailable(device)
-        if reason is not None:
-            raise BackendUnavailable(reason)
-        if not 1 <= suffix <= MAX_SUFFIX:
-            raise BackendError(f"the denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
+        check_covered("the denoising kernel", unavailable(device), suffix, MAX_SUFFIX)
         if pair and (suffix <= FEW or suffix % 2):
             raise BackendError(f"two observations have an even number of tokens above {FEW}, not {suffix}")
-        self._config = config
-        self._packed = packed
-        arrangement = self._packed.arrangement
-        g, properties = config.expert, torch.cuda.get_device_properties(device)
+        arrangement, g = packed.arrangement, config.expert
+        properties = torch.cuda.get_device_properties(device)
         assert table.shape[1:] == (2 * g.depth + 1, 3, g.width), table.shape
         sizes = kernel_sizes(
             arrangement,
             cache_rows=cache_rows,
             suffix=suffix,
-            fp8=self._packed.fp8,
+            fp8=packed.fp8,
             shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
             by_token=by_token,
             pair=pair,
@@ -348,63 +338,49 @@ class DenoiseKernel:
         with torch.cuda.device(device):
             arch = f"sm_{properties.major}{properties.minor}a"
             cubin = compiled(arch, sizes)
-            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SHARED_BYTES"])
-            self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
-            self._tiles = g.depth * sizes["TP_KEY_TILES"]
-            fitting = self._kernel.max_active_clusters(RANKS, THREADS)
+            loop = Launched(Kernel(cubin, "turbopi_denoise", sizes["TP_SHARED_BYTES"]), arrangement.blocks, THREADS)
+            tiles = g.depth * sizes["TP_KEY_TILES"]
+            prepare = Launched(Kernel(cubin, "turbopi_denoise_prepare", 0), tiles, 256)
+            fitting = loop.kernel.max_active_clusters(RANKS, THREADS)
             if fitting < arrangement.clusters:
                 raise BackendUnavailable(
                     f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
                     f"{torch.cuda.get_device_name(device)} holds {fitting}"
                 )
-        self._suffix, self._blocks, self._by_token, self._pair = suffix, arrangement.blocks, by_token, pair
+        self._by_token, self._pair = by_token, pair
         self._kept = _room_to_keep(config, suffix, device) if keep else None
-        self._steps = len(table) if num_steps is None else num_steps
         self._table = table.to(device).float().contiguous()
-        tables = Tables.make(self._packed, self._table)
-        self._tensors = {
-            "weights": self._packed.weights,
-            "starts": self._packed.starts,
+        tables = Tables.make(packed, self._table)
+        tensors = {
+            "weights": packed.weights,
+            "starts": packed.starts,
             "table": tables.modulation,
             "row_scales": tables.row_scales,
             "shifted": _beside_each_other(tables.shifted) if by_token else tables.shifted,
             "values_times": tables.values_times,
-            "out_w": small["action_out_proj.weight"].float().T.contiguous(),
-            "out_shift": affine(small, "action_out_proj", self._table[:, -1, 1].double()).float().contiguous(),
-            "in_w": small["action_in_proj.weight"].float().contiguous(),
-            "in_b": small["action_in_proj.bias"].float().contiguous(),
-            "inv_freq": inverse_frequencies(config, device),
+            **end_tensors(
+                *(config, small, self._table),
+                out_w=small["action_out_proj.weight"].T,
+                in_w=small["action_in_proj.weight"],
+            ),
             "keys": torch.empty(
                 g.depth * 2 * sizes["TP_KEY_TILES"] * BLOCK * g.head_dim, dtype=torch.bfloat16, device=device
             ),
             "scratch": torch.empty(4 * sizes["TP_SCRATCH_WORDS"], dtype=torch.int32, device=device),
-            "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
+            "hang": torch.zeros(arrangement.blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
             "clock": torch.zeros(2, dtype=torch.int64, pin_memory=True),  # see `clock_mhz`
-            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),
+            "trace": torch.zeros(arrangement.blocks, 64, dtype=torch.int32, device=device),
         }
-
-    def launch(
-        self,
-        noise: Tensor,
-        cache_k: Tensor,
-        cache_v: Tensor,
-        length: Tensor,
-        x_t: Tensor,
-        v_t: Tensor,
-        tokens: TokenInputs | None = None,
-    ) -> None:
-        """Denoise on the current stream.
-
-        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
-        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A]. `tokens`: by token.
-        """
-        assert not self._pair and length.dtype == torch.int64, (self._pair, length.dtype)
-        assert (tokens is not None) == self._by_token, "a kernel by token takes `tokens`, another doesn't"
-        values = self._values(noise, cache_k, cache_v, x_t, v_t) | {"length": length.data_ptr()}
-        if tokens is None:
-            self._launch(ARGS.value(values))
-        else:
-            self._launch(ARGS_BY_TOKEN.value(values | self._token_pointers(tokens)))
+        super().__init__(
+            config,
+            steps=len(table) if num_steps is None else num_steps,
+            suffix=suffix,
+            arguments=arguments(by_token, pair, keep),
+            tensors=tensors,
+            numbers={"layer_bytes": packed.layer_bytes, "zero": 0},
+            prepare=prepare,
+            loop=loop,
+        )
 
     def launch_step(
         self, step: int, x_t: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, v_t: Tensor, tokens: TokenInputs
@@ -415,17 +391,17 @@ class DenoiseKernel:
         of_step = {name: getattr(tokens, name)[step : step + 1] for name in ("rows", "steps", "times")}
         one = TokenInputs(**of_step, target=tokens.target, gain=beside["gain"])
         own_k, own_v = (cache[:, cache.shape[1] - self._suffix :] for cache in (cache_k, cache_v))
-        values = self._values(x_t, cache_k, cache_v, beside["x_t"], v_t[None]) | self._token_pointers(one)
-        pointers = {
-            "length": length,
-            "kept_x": kept.stream,
-            "kept_q": kept.q,
-            "kept_gate_up": kept.gate_up,
-            "own_k": own_k,
-            "own_v": own_v,
-        }
-        values |= {name: t.data_ptr() for name, t in pointers.items()}
-        self._launch(ARGS_KEEPING.value(values | {"keys_ready": int(step > 0)}))
+        self._launch(
+            *(x_t, cache_k, cache_v, beside["x_t"], v_t[None]),
+            length=length,
+            kept_x=kept.stream,
+            kept_q=kept.q,
+            kept_gate_up=kept.gate_up,
+            own_k=own_k,
+            own_v=own_v,
+            keys_ready=int(step > 0),
+            **self._token_tensors(one),
+        )
         return kept
 
     def launch_pair(
@@ -435,28 +411,12 @@ class DenoiseKernel:
         assert self._pair and segments.shape == (3,) and segments.dtype == torch.int32 and segments.is_contiguous()
         beside = noise.flatten(0, 1), cache_k, cache_v, x_t.flatten(1, 2), v_t.flatten(1, 2)
         assert all(t.is_contiguous() for t in (noise, x_t, v_t)), "the kernel writes where they lie"
-        self._launch(ARGS_OF_PAIR.value(self._values(*beside) | {"segments": segments.data_ptr()}))
+        self._launch(*beside, segments=segments)
 
-    def _launch(self, args: Any) -> None:
-        self._prepare.launch(self._tiles, 256, args)
-        self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
-
-    def _values(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, x_t: Tensor, v_t: Tensor) -> dict[str, Any]:
-        """Of the kernel's arguments those that all forms have."""
-        steps, g = self._steps, self._config.expert
-        chunk = (steps, self._suffix, self._config.action_dim)
-        check_launch(noise, cache_k, cache_v, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
-        tensors = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "noise": noise, "x_t": x_t, "v_t": v_t}
-        return {name: t.data_ptr() for name, t in tensors.items()} | {
-            "layer_stride": cache_k.stride(0) * 2,
-            "layer_bytes": self._packed.layer_bytes,
-            "steps": steps,
-            "dt": float(np.float32(-1.0 / steps)),
-            "eps": self._config.rms_norm_eps,
-            "zero": 0,
-        }
-
-    def _token_pointers(self, tokens: TokenInputs) -> dict[str, int]:
+    def _token_tensors(self, tokens: TokenInputs | None) -> dict[str, Tensor]:
+        assert (tokens is not None) == self._by_token, "a kernel by token takes `tokens`, another doesn't"
+        if tokens is None:
+            return {}
         by_step = self._steps, self._suffix
         given = {
             "token_rows": (tokens.rows, by_step),
@@ -469,7 +429,7 @@ class DenoiseKernel:
             dtype = torch.int32 if name == "token_rows" else torch.float32
             assert t.shape == shape and t.dtype == dtype and t.is_contiguous(), (name, t.shape, t.dtype)
             assert t.device == self._table.device, (name, t.device)
-        return {name: t.data_ptr() for name, (t, _) in given.items()}
+        return {name: t for name, (t, _) in given.items()}
 
     def clock_mhz(self) -> float | None:
         """The multiprocessors' clock during the last launch that has ended, in MHz, which may be lower than what

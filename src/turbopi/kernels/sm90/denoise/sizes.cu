@@ -140,16 +140,3 @@ constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM, B_END = B_KV + 2 * N_KV;
-
-// ---- barriers. Who waits at which, and what each protects: docs/dev/denoising_kernel.md.
-
-// Of warps of a CTA (bar.sync, bar.arrive); 0 is __syncthreads. score.cu and many/attention.cu name those of attention,
-// 2 to 6. Macros, as one constant more in this scope changes the code that ptxas makes.
-#define CONSUMERS_MEET 1     // all W warps that multiply
-#define SQUARES_KEPT 7       // many: the warps that keep the stream have stored their tiles' sums of squares
-#define TILE_MEETS 8         // and 7 more: the warps that share a tile, or pairs of warps, have stored partial sums
-#define HIDDEN_BLOCK_MADE 2  // and 3 more (COPY_HIDDEN), between attentions: four warps have made two tiles' hidden units
-
-// In shared memory (mbarrier): the stream, queries, largest logits, partial outputs to be combined, attention, hidden
-// units, what ranks add to v_t, the next step, 1 / rms; ring: full and empty, by slot
-enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };

@@ -3,7 +3,6 @@
 `tiles` are those that `turbopi tune` measured on this GPU; gemm/tiles.py and best_tile choose what they don't have.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any, Literal
@@ -122,14 +121,11 @@ def added(
     x: Tensor,
     weight: Matrix,
     bias: Tensor | None = None,
-    ahead: Callable[[], Tensor | None] = lambda: None,
+    ahead: Tensor | None = None,
     *,
     tiles: TileTable = NO_TILES,
 ) -> bool:
-    """Add the product to the stream in place, if that is the faster way. Returns whether it did.
-
-    ahead: is asked, if so, for what may be fetched into L2.
-    """
+    """Add the matmul to the stream in place, if that is the faster way. Returns whether it did."""
     if len(x) < ADDING_ROWS:
         return False
     (rows, inner), columns = x.shape, weight.shape[0]
@@ -140,9 +136,9 @@ def added(
         cut = chosen(tiles, operation, rows, columns, inner)
     if isinstance(cut, Tile) and cut.splits == 1:
         if isinstance(weight, ScaledMatrix):
-            matmul_fp8(x, weight, cut, "added", bias, stream, ahead=ahead())
+            matmul_fp8(x, weight, cut, "added", bias, stream, ahead=ahead)
         else:
-            matmul(x, weight, cut, "added", bias, stream, ahead=ahead())
+            matmul(x, weight, cut, "added", bias, stream, ahead=ahead)
         return True
     return False  # parts are added in the norm; the library loses more by the stream than the norm gains
 
