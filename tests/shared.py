@@ -30,7 +30,8 @@ GOLDEN = ROOT / "tests" / "golden"
 LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
 sys.path.insert(0, LAB.name)
-torch.set_num_threads(2)
+if not torch.cuda.is_available():
+    torch.set_num_threads(1)  # scripts/test runs two processes on two cores
 
 
 def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
