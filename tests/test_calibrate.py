@@ -179,6 +179,7 @@ def test_values_that_are_not_finite_are_refused_by_site() -> None:
 # What is chosen
 
 
+@pytest.mark.slow
 def test_sites_stay_in_bf16_until_the_target_is_met() -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
     own = golden_calls(case)
@@ -208,6 +209,7 @@ def test_actions_without_a_signal_are_not_calibrated_on(monkeypatch: pytest.Monk
         run._Trials(model, own, 1, 1, run.Progress(), RoundedWeights())
 
 
+@pytest.mark.slow
 def test_directions_more_than_halve_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
     settings, errors = Settings({}, target=0.0, batch=1, methods=("headroom",)), []
@@ -221,6 +223,7 @@ def test_directions_more_than_halve_the_error(monkeypatch: pytest.MonkeyPatch) -
         assert errors[0][name]["relative_rms"] < 0.8 * errors[1][name]["relative_rms"], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [("expert",), PARTS])
 def test_directions_more_than_halve_what_weights_alone_lose(parts: tuple[str, ...]) -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
@@ -246,6 +249,7 @@ def test_the_expert_is_weighed_as_the_whole_that_it_goes_as() -> None:
     assert by_harm(rms, work) == [("vision.out",), ("vision.fc2",), expert, ("prefix.down",)]
 
 
+@pytest.mark.slow
 def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("turbopi.calibrate.statistics.PERCENTILE", 90.0)  # a tenth of the values is beyond
     model, own = golden_model("pi05"), golden_calls(golden_cases()["b_third_masked"])
@@ -594,6 +598,7 @@ def test_a_file_keeps_its_identity(tmp_path: Path) -> None:
 # Formats without kernels
 
 
+@pytest.mark.slow
 def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
     calibration = golden_calibration(golden_folder(), "pi0", torch.device("cpu"), 0.0)
     assert calibration.report["observations"]["source"] == "the golden cases themselves"
@@ -616,6 +621,7 @@ def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
 # The command
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Path) -> None:
     out = tmp_path / "tiny_fp8.json"
     quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
@@ -639,6 +645,7 @@ def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Pa
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments | {"precision": "bf16"})  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
     out = tmp_path / "int8.json"
     quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
@@ -659,6 +666,7 @@ def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
     assert "--precision 'bf16' isn't what calibration is for; choose fp8 or int8" in said
 
 
+@pytest.mark.slow
 def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(b"weights")
@@ -673,6 +681,7 @@ def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
     assert "there is no folder nowhere" in refusal(turbopi("calibrate", "nowhere", *quick))
 
 
+@pytest.mark.slow
 def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
     checkpoint = random_checkpoint("pi05_tiny")
     policy = UnifiedPolicy(shipped.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
@@ -688,6 +697,7 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     assert document.calibrated is not None and document.calibrated["observations"] == "x"
 
 
+@pytest.mark.slow
 def test_held_out_observations_that_are_none_are_warned_of(tmp_path: Path) -> None:
     policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu")
     call = RecordedCall(policy.example_observation(0), {"actions": np.zeros((10, 7))}, 0.0)

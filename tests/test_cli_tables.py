@@ -85,6 +85,7 @@ def test_a_wide_table_comes_in_parts_with_its_sections_and_styles() -> None:
 TINY = ("--random-weights", "pi05_tiny")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -111,6 +112,7 @@ def test_commands_cut_nothing_at_eighty_columns(
     nothing_is_cut(*with_tables(monkeypatch, *words))
 
 
+@pytest.mark.slow
 def test_the_tables_of_eval_and_compare_are_whole_at_eighty_columns(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

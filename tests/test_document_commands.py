@@ -84,6 +84,7 @@ def needs_nothing(words: list[str]) -> bool:
     return words in (["backends"], ["doctor"]) or "pi05_tiny" in words or reckons
 
 
+@pytest.mark.slow
 def test_commands_that_need_no_checkpoint_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tutorial's run in tests/test_tutorial.py."""
     monkeypatch.chdir(tmp_path)

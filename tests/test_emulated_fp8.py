@@ -57,6 +57,7 @@ def actions(backend: backends.Backend) -> Tensor:
     return backend.sample(case.observation, case.noise, STEPS).actions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier", TIERS)
 def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     case, model = golden_cases()[CASE], golden_model("pi05")
@@ -73,6 +74,7 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     assert 1e-3 < float((ours[0] - exact).norm() / exact.norm()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
 def test_golden_cases_hold(numbers: Numbers, monkeypatch: pytest.MonkeyPatch) -> None:
     def known(folder: GoldenFolder, kind: Kind, device: torch.device, format: Format) -> Quantization:
@@ -99,6 +101,7 @@ def test_in_int8_the_experts_activations_stay_and_products_err_less_than_in_fp8(
     assert model.config.expert.depth * 4 == len(experts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier", ["fp8", "int8"])
 def test_damage_is_refused_and_harms_no_other_observation(tier: Tier) -> None:
     """A NaN in what one prompt alone has; then one, in INT8 an infinity too, where rounding would hide it."""
@@ -172,6 +175,7 @@ def test_auto_never_takes_it() -> None:
         assert backends.choose(CPU, tier)[0] == "fused"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
 def test_verify_and_bench_run_it(numbers: str, tmp_path: Path) -> None:
     small = "src/turbopi/data/small_policy"

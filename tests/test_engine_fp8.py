@@ -110,6 +110,7 @@ def damages(weights: Weights) -> dict[str, Tensor]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [*FORMATS, "f32"])
 def test_damage_anywhere_reaches_the_actions_and_goes_with_it(numbers: str) -> None:
     model, (observation, noise) = golden_model("pi05"), made_up("pi05", 1, 5)
@@ -231,6 +232,7 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     assert moved == [CPU]
 
 
+@pytest.mark.slow
 def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
     """In bfloat16 with the expert's first copy, which stays; in FP8 with matrices of their own, and it goes away."""
     backend = FusedBackend.__new__(FusedBackend)
@@ -306,6 +308,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     assert packed.numbers == "int8" and bool((packed.inputs == 1).all())
 
 
+@pytest.mark.slow
 def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
     backend, calibration = FusedBackend.__new__(FusedBackend), golden_calibration(golden_folder(), "pi05", CPU)
     everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}

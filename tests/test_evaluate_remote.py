@@ -59,6 +59,7 @@ def server(policy: UnifiedPolicy) -> Iterator[serve.PolicyServer]:
         yield running
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["async", *RTC])
 def test_a_server_gives_the_same_actions_as_the_policy_in_this_process(
     way: str, policy: UnifiedPolicy, server: serve.PolicyServer, tmp_path: Path

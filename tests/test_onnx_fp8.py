@@ -20,6 +20,8 @@ from turbopi.models.pi0.layers import GeGLU
 from turbopi.models.pi0.reference import Pi0Model
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.slow
+
 needs_rtx = pytest.mark.skipif(importlib.util.find_spec("tensorrt_rtx") is None, reason="TensorRT-RTX isn't installed")
 
 

@@ -272,6 +272,7 @@ def test_convert_records_a_built_in_robot_and_no_class(tmp_path: Path) -> None:
     assert not (tmp_path / "class").exists()
 
 
+@pytest.mark.slow
 def test_calibrate_reads_the_robots_keys(arm_json: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for number in range(3):

@@ -312,6 +312,7 @@ def test_sessions_are_not_waited_for_where_joining_together_does_not_pay() -> No
 # --- a real policy ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("pays")
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_a_real_policys_joined_chunks_are_those_of_their_session_in_any_company(mode: str) -> None:

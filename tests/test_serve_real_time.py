@@ -627,6 +627,7 @@ def drive(executor: RealTimeExecutor, observation: dict[str, Any], chunks: int) 
     return kinds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("execution", ["sync", "rtc", "rtc_identity"])
 @pytest.mark.parametrize("remote", [False, True])
 def test_the_executor_runs_a_real_policy_here_and_on_a_server(

@@ -24,7 +24,7 @@ try:
 except SimulatorUnavailable as error:
     pytest.skip(str(error), allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("default")  # the simulator's libraries warn as they like
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]  # the simulator's libraries warn as they like
 SUITE, TASK = "libero_spatial", 0
 PX = 128
 

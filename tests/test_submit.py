@@ -44,6 +44,7 @@ def submitting(policy: UnifiedPolicy) -> tuple[UnifiedPolicy, Submitting]:
     return policy_on(lambda *_, **__: backend, random_checkpoint("pi05_tiny"), num_denoising_steps=2), backend
 
 
+@pytest.mark.slow
 def test_submitted_calls_give_what_infer_gives(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
     expected = [policy.infer(obs, seed=seed)["actions"] for seed, obs in enumerate(observations)]

@@ -210,6 +210,7 @@ def test_a_compiler_that_is_switched_off_is_unavailable(variable: str, monkeypat
 # -- a horizon for one call --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [1, 6, 16])
 def test_a_call_may_have_a_horizon_of_its_own(horizon: int, reference: UnifiedPolicy) -> None:
     policy, obs = made(), seen_by(2, reference)
