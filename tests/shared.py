@@ -83,8 +83,9 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
 
 @pytest.fixture(scope="session")
 def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where CUDA kernels are kept, so that each is compiled once a session."""
-    return tmp_path_factory.mktemp("cubins")
+    """Where CUDA kernels are kept, so that each is compiled once, for all of a run's processes."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cubins"
 
 
 @pytest.fixture
