@@ -7,6 +7,7 @@ import gpu_evidence
 import pytest
 from shared import (  # noqa: F401
     GOLDEN,
+    TWO_LAYERS,
     _own_fingerprints,
     cubins,
     drawn,
@@ -17,10 +18,18 @@ from shared import (  # noqa: F401
     gpu_or_interpreter,
     on_hopper,
     packed_arrays,
+    two_layers,
+    unseen_plots,
 )
 
 # Those that take longest, longest first.
-LONGEST: tuple[str, ...] = ()
+LONGEST = (
+    *("test_serve_fleet_faults", "test_sim_libero", "test_examples", "test_tutorial", "test_emulated_fp8", "test_onnx"),
+    *("test_onnx_fp8", "test_engine_batch_conditioned", "test_kernels_denoise_by_token", "test_engine_backward"),
+    *("test_studies_simulated", "test_kernels_portable_denoise_emulated", "test_backends", "test_verify"),
+    *("test_calibrate", "test_bench", "test_checkpoint_memory", "test_gpu_evidence", "test_kernels_emulated"),
+    *("test_kernels_denoise_emulated", "test_kernels_attention_emulated", "test_serve_schedule", "test_cli_tables"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

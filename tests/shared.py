@@ -7,7 +7,8 @@ import tempfile
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,14 @@ import pytest
 import torch
 from distributions import install
 from matplotlib.figure import Figure
+from PIL import Image
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
+    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # no processes that import PyTorch once more, to compile
+    torch.set_num_threads(1)  # scripts/test runs two processes on two cores
 
-from turbopi.config import Kind
+from turbopi.config import PRESETS, Kind
 from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
@@ -30,8 +34,10 @@ GOLDEN = ROOT / "tests" / "golden"
 LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
 sys.path.insert(0, LAB.name)
-if not torch.cuda.is_available():
-    torch.set_num_threads(1)  # scripts/test runs two processes on two cores
+SIX_LAYERS = PRESETS["pi05_tiny"].model
+TWO_LAYERS = PRESETS["pi05_tiny"].with_model(
+    **{part: replace(getattr(SIX_LAYERS, part), depth=2) for part in ("vision", "vlm", "expert")}
+)
 
 
 def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
@@ -100,6 +106,30 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     monkeypatch.setattr(Figure, "savefig", keeping)
     return figures
+
+
+@pytest.fixture(scope="module")
+def two_layers() -> Iterator[None]:
+    """`pi05_tiny` has two layers of its six in this process: a third of the time, and nothing else is different."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(PRESETS, "pi05_tiny", TWO_LAYERS)
+        yield
+
+
+@pytest.fixture(scope="module")
+def unseen_plots() -> Iterator[None]:
+    """Plots become PNGs of one pixel, where no test looks at them: drawing takes longer than all else of small runs."""
+    save = Figure.savefig
+
+    def dot(self: Figure, file: Any, *more: Any, **options: Any) -> None:
+        if options.get("format") == "png":
+            Image.new("L", (1, 1)).save(file, "png")
+        else:
+            save(self, file, *more, **options)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Figure, "savefig", dot)
+        yield
 
 
 @pytest.fixture(scope="session")

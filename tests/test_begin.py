@@ -22,6 +22,8 @@ from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.support.errors import BackendError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 CPU = torch.device("cpu")
 
 

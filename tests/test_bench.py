@@ -42,6 +42,8 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 from turbopi.support.reading import as_document
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 CPU = torch.device("cpu")
 CHECKED_IN = Path(__file__).parents[1] / "benchmarks/results/cpu_2026-11-21_small_policy_bench.json"
 

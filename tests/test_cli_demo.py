@@ -23,6 +23,8 @@ from turbopi.support.action_groups import action_groups
 from turbopi.support.errors import BackendError, TurboPiError
 from turbopi.verify import control, demo
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 
 def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
     return UnifiedPolicy(random_checkpoint(preset), backend="pytorch", precision="f32", num_denoising_steps=2)

@@ -18,6 +18,8 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 from turbopi.recordings import RecordedCall, save_call
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
 
 

@@ -222,7 +222,7 @@ def test_a_port_is_ready_once_every_number_of_cameras_is_warm(monkeypatch: pytes
 
 @pytest.mark.slow
 def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
-    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY[:2], "--steps", "300", "--port", "0"]
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY[:2], "--steps", "100", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

@@ -17,6 +17,8 @@ from turbopi.cli.framework import Output
 from turbopi.cli.tables import fitted
 from turbopi.robots import create_robot
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 WORDS = st.text("abcdefghij", min_size=1, max_size=12)
 NUMBERS = st.floats(-1e5, 1e5).map(lambda number: f"{number:+.4f}")
 

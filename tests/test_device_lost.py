@@ -19,6 +19,8 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.support.errors import BackendError, BackendUnavailable, DeviceLost, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 ILLEGAL = "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported"
 

@@ -12,6 +12,8 @@ from cli_helpers import turbopi
 
 from turbopi.cli import app
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 GROUP = typer.main.get_command(app)

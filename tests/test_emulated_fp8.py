@@ -177,20 +177,20 @@ def test_auto_never_takes_it() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
-def test_verify_and_bench_run_it(numbers: str, tmp_path: Path) -> None:
-    small = "src/turbopi/data/small_policy"
+def test_verify_and_bench_run_it(two_layers: None, numbers: str, tmp_path: Path) -> None:
+    tiny = ("--random-weights", "pi05_tiny")
     file, backend = tmp_path / "calibration.json", f"emulated_{numbers}"
     noise = ("--observations", "random-noise", "--count", 2, "--steps", 2)
-    made = turbopi("calibrate", small, "--precision", numbers, *noise, "--out", file)
+    made = turbopi("calibrate", *tiny, "--precision", numbers, *noise, "--out", file)
     assert made.exit_code == 0, made.output
     options = ("--precisions", numbers, "--quantization", file, "--device", "cpu", "--json")
     few = ("--count", 1, "--noises", 1, "--steps", 2)
-    verified = turbopi("verify", small, "--backend", backend, "--precision", numbers, *few, *options[2:])
+    verified = turbopi("verify", *tiny, "--backend", backend, "--precision", numbers, *few, *options[2:])
     document = json.loads(verified.stdout)
     assert verified.exit_code == (0 if document["ok"] else 1), verified.output
     assert (document["backend"], document["precision"]) == (backend, numbers)
     assert document["actions"]["relative_rms"] > 0, "nothing was rounded"
     quick = ("--calls", 1, "--main-calls", 1, "--steps", 1, "--no-error")
-    benched = turbopi("bench", small, "--backends", backend, *quick, *options)
+    benched = turbopi("bench", *tiny, "--backends", backend, *quick, *options)
     assert benched.exit_code == 0, benched.output
     assert json.loads(benched.stdout)["results"][0]["precision"] == numbers

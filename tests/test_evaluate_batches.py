@@ -21,6 +21,8 @@ from turbopi.evaluate.sources import LocalPolicy
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.support.errors import ActionError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 H = 10
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none --max-steps 3"
 

@@ -18,6 +18,8 @@ from turbopi.sim import libero
 from turbopi.support.errors import ConfigError
 from turbopi.support.installation import install_command
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none"
 
 

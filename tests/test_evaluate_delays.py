@@ -24,6 +24,8 @@ from turbopi.sim import create
 from turbopi.sim.base import Task
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 TASK = Task(0, "count", "count", 10, 30)
 
 

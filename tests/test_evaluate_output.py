@@ -22,6 +22,8 @@ from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
 from turbopi.evaluate.visited import Visited, action_error
 from turbopi.support.errors import ConfigError, OutputError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 GROUPS = chunk_groups("libero", 7)
 
 

@@ -26,6 +26,8 @@ from turbopi.sim import create
 from turbopi.sim.base import Task
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 HZ, STEP = 20.0, 1 / 20
 TASK = Task(0, "count", "count", 10, 60)
 OFFERED = {"modes": ["rtc", "rtc_identity", "rtc_trained"], "trained_max_delay": 4}

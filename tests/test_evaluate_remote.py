@@ -18,6 +18,8 @@ from turbopi.policy.shipped import CHASE_POLICY
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 RTC = ("rtc", "rtc_identity", "rtc_trained")
 STATES = (0, 1)
 

@@ -24,6 +24,8 @@ from turbopi.sim.base import Task
 from turbopi.support.errors import ActionError, ConfigError, OutputError, TurboPiError
 from turbopi.support.files import alone_in
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 TROUBLED = "evaluate_fakes:TroubledSimulator"
 
 

@@ -21,6 +21,8 @@ from turbopi.sim.base import observation_problem
 from turbopi.sim.reacher import ReacherSimulator
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 
 @pytest.fixture(autouse=True)
 def _no_plots(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,8 @@ from turbopi.preprocess.pipeline import Pipeline
 from turbopi.robots import Robot, RobotInputs
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 TINY = ("--random-weights", "pi05_tiny")
 ARM = {
     "name": "my_arm",

@@ -26,6 +26,8 @@ from turbopi.policy.chunk_conditioning import Joining
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H, A = 10, 32
 TRAINED = RealTime(trained_max_delay=3)
 

@@ -24,6 +24,8 @@ from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.serve.scheduling.schedule import Request, Schedule
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 GUIDED: dict[str, Any] = {"execution": "rtc", "control_hz": 50.0}
 
 

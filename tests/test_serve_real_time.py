@@ -34,6 +34,8 @@ from turbopi.serve.options import JOINING
 from turbopi.serve.real_time import RealTime
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H, A = 10, 3
 REAL_TIME = {"modes": ["rtc", "rtc_identity", "rtc_trained"], "trained_max_delay": 2, "execution_horizon": None}
 

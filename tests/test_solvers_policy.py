@@ -22,6 +22,8 @@ from turbopi.models.pi0.solvers import SOLVERS, Integration
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 UNEVEN = (1.0, 0.7, 0.2, 0.0)
 
 

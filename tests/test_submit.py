@@ -14,6 +14,8 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.models.observation import Observation
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 
 @pytest.fixture(scope="module")
 def policy() -> UnifiedPolicy:

@@ -30,6 +30,8 @@ from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order,
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 STEPS = 2
 WEIGHTS = ("--random-weights", "pi05_tiny")
 QUICK = (*WEIGHTS, "--device", "cpu", "--steps", STEPS, "--count", 1, "--noises", 2)

@@ -22,6 +22,8 @@ from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
 from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H = 10
 
 

@@ -43,6 +43,8 @@ from turbopi_lab.studies.rollouts import CHASE, Call, met, open_policy, play, sa
 from turbopi_lab.studies.spread import UNIFORM, bimodality
 from turbopi_lab.studies.study import Setup
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 BROKEN = Control("Two and two is four.", False, "It is five.")
 
 
