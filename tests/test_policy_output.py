@@ -99,7 +99,7 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
 ) -> None:
     policy, _, clock = answering(whole, kind)
     for module in ("policy", "model_call"):
-        monkeypatch.setattr(f"turbopi.{module}.time", SimpleNamespace(perf_counter=clock))
+        monkeypatch.setattr(f"turbopi.policy.{module}.time", SimpleNamespace(perf_counter=clock))
     pipeline = policy.pipeline
     first = "see" if kind == "begin" else "before"
     monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))
