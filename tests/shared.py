@@ -1,5 +1,6 @@
 """What the tests of Turbo-Pi and of turbopi-lab share: the golden folder and models built from it, fixtures."""
 
+import atexit
 import json
 import os
 import sys
@@ -34,6 +35,7 @@ GOLDEN = ROOT / "tests" / "golden"
 LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
 sys.path.insert(0, LAB.name)
+atexit.register(LAB.cleanup)
 SIX_LAYERS = PRESETS["pi05_tiny"].model
 TWO_LAYERS = PRESETS["pi05_tiny"].with_model(
     **{part: replace(getattr(SIX_LAYERS, part), depth=2) for part in ("vision", "vlm", "expert")}
