@@ -1,9 +1,13 @@
 """What several test files share, which is in shared.py, and what every run of the tests says."""
 
+from collections import defaultdict
+from pathlib import Path
+
 import gpu_evidence
 import pytest
 from shared import (  # noqa: F401
     GOLDEN,
+    TWO_LAYERS,
     _own_fingerprints,
     cubins,
     drawn,
@@ -14,24 +18,37 @@ from shared import (  # noqa: F401
     gpu_or_interpreter,
     on_hopper,
     packed_arrays,
+    two_layers,
+    unseen_plots,
 )
 
-# Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
-QUICK = (
-    *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
-    *("test_launch_geometry", "test_recent_loops", "test_tools_mutate"),
+# Those that take longest, longest first.
+LONGEST = (
+    *("test_serve_fleet_faults", "test_sim_libero", "test_examples", "test_tutorial", "test_emulated_fp8", "test_onnx"),
+    *("test_onnx_fp8", "test_engine_batch_conditioned", "test_kernels_denoise_by_token", "test_engine_backward"),
+    *("test_studies_simulated", "test_kernels_portable_denoise_emulated", "test_backends", "test_verify"),
+    *("test_calibrate", "test_bench", "test_checkpoint_memory", "test_gpu_evidence", "test_kernels_emulated"),
+    *("test_kernels_denoise_emulated", "test_kernels_attention_emulated", "test_serve_schedule", "test_cli_tables"),
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.path.stem in QUICK and item.get_closest_marker("gpu") is None:
-            item.add_marker(pytest.mark.quick)
+    """No process shall begin a long file when the others are done."""
+    place = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say at the end of every run that the GPU tests weren't run on this code, if that is so."""
+    """Say at the end of every run what was skipped, and whether the GPU tests were run on this code."""
     waiting = gpu_evidence.pending()
     if waiting is not None:
         terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
         terminalreporter.line(f"since {waiting.date}: {waiting.reason}. Run scripts/gpu_check on a Hopper GPU.")
+    skipped = defaultdict[str, list[str]](list)
+    for report in terminalreporter.stats.get("skipped", ()):
+        file, _, reason = report.longrepr
+        skipped[reason.removeprefix("Skipped: ").partition("; ")[0]].append(Path(file).stem)
+    if skipped:
+        terminalreporter.section("what was skipped, and why")
+    for reason, files in sorted(skipped.items()):
+        terminalreporter.line(f"skipped: {len(files)} of {', '.join(sorted(set(files)))}: {reason}")

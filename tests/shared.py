@@ -1,5 +1,6 @@
 """What the tests of Turbo-Pi and of turbopi-lab share: the golden folder and models built from it, fixtures."""
 
+import atexit
 import json
 import os
 import sys
@@ -7,7 +8,8 @@ import tempfile
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,11 +19,14 @@ import pytest
 import torch
 from distributions import install
 from matplotlib.figure import Figure
+from PIL import Image
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
+    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # no processes that import PyTorch once more, to compile
+    torch.set_num_threads(1)  # scripts/test runs two processes on two cores
 
-from turbopi.config import Kind
+from turbopi.config import PRESETS, Kind
 from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
@@ -30,7 +35,11 @@ GOLDEN = ROOT / "tests" / "golden"
 LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree has them, whatever is installed
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
 sys.path.insert(0, LAB.name)
-torch.set_num_threads(2)
+atexit.register(LAB.cleanup)
+SIX_LAYERS = PRESETS["pi05_tiny"].model
+TWO_LAYERS = PRESETS["pi05_tiny"].with_model(
+    **{part: replace(getattr(SIX_LAYERS, part), depth=2) for part in ("vision", "vlm", "expert")}
+)
 
 
 def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
@@ -82,8 +91,9 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
 
 @pytest.fixture(scope="session")
 def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where CUDA kernels are kept, so that each is compiled once a session."""
-    return tmp_path_factory.mktemp("cubins")
+    """Where CUDA kernels are kept, so that each is compiled once, for all of a run's processes."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cubins"
 
 
 @pytest.fixture
@@ -98,6 +108,30 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     monkeypatch.setattr(Figure, "savefig", keeping)
     return figures
+
+
+@pytest.fixture(scope="module")
+def two_layers() -> Iterator[None]:
+    """`pi05_tiny` has two layers of its six in this process: a third of the time, and nothing else is different."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(PRESETS, "pi05_tiny", TWO_LAYERS)
+        yield
+
+
+@pytest.fixture(scope="module")
+def unseen_plots() -> Iterator[None]:
+    """Plots become PNGs of one pixel, where no test looks at them: drawing takes longer than all else of small runs."""
+    save = Figure.savefig
+
+    def dot(self: Figure, file: Any, *more: Any, **options: Any) -> None:
+        if options.get("format") == "png":
+            Image.new("L", (1, 1)).save(file, "png")
+        else:
+            save(self, file, *more, **options)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Figure, "savefig", dot)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -26,6 +26,7 @@ def create(name: str, precision: FloatPrecision = "f32") -> backends.Backend:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # the compiler's own
 @pytest.mark.skipif(
     backends.availability("pytorch_compile", CPU) is not None, reason="torch.compile needs a C++ compiler"
@@ -54,6 +55,7 @@ def test_auto_says_what_it_chose_and_why() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_backend_is_imported_when_it_is_asked_for() -> None:
     code = "import sys, turbopi.backends as b; print([m for m in sys.modules if m.startswith('turbopi.backends.')])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

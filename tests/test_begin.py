@@ -22,6 +22,8 @@ from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.support.errors import BackendError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 CPU = torch.device("cpu")
 
 
@@ -124,6 +126,7 @@ def test_actions_are_the_references(policy: UnifiedPolicy, reference: UnifiedPol
         assert parts == pytest.approx(timing["total_ms"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_batch_equals_its_observations(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
     alone = [policy.infer(observation, seed=seed)["actions"] for seed, observation in enumerate(observations)]
@@ -132,6 +135,7 @@ def test_a_batch_equals_its_observations(policy: UnifiedPolicy) -> None:
         np.testing.assert_allclose(one["actions"], actions, atol=1e-4)  # sums in another order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "arguments"),
     [
@@ -153,6 +157,7 @@ def test_what_goes_wrong_behind_vision_leaves_the_next_call_right(
     np.testing.assert_array_equal(policy.infer(good, seed=0)["actions"], expected)
 
 
+@pytest.mark.slow
 def test_calls_from_several_threads_get_their_own_answers(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(4)]
     expected = [policy.infer(observation, seed=seed)["actions"] for seed, observation in enumerate(observations)]
@@ -171,6 +176,7 @@ def test_calls_from_several_threads_get_their_own_answers(policy: UnifiedPolicy)
     assert not wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 @pytest.mark.parametrize("warm", [False, True])
 def test_every_bucket_and_number_of_cameras_in_turn_equals_a_call_of_its_own(kind: Kind, warm: bool) -> None:

@@ -42,6 +42,8 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 from turbopi.support.reading import as_document
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 CPU = torch.device("cpu")
 CHECKED_IN = Path(__file__).parents[1] / "benchmarks/results/cpu_2026-11-21_small_policy_bench.json"
 
@@ -84,6 +86,7 @@ def test_prompts_have_exactly_the_tokens_asked_for(policy: UnifiedPolicy, tokens
         assert policy.prepare(next(observations)).token_mask.sum() == tokens
 
 
+@pytest.mark.slow
 def test_jobs_that_join_a_running_chunk_are_measured_and_judged(policy: UnifiedPolicy) -> None:
     plain, *joined = (Job(steps=2, join=join) for join in JOINS)
     alone = answers(policy, plain, observations=1)
@@ -130,6 +133,7 @@ def test_percentiles() -> None:
     assert latency.percentiles[99] == pytest.approx(99.01)
 
 
+@pytest.mark.slow
 def test_a_measurement_ends_early_but_has_its_fewest_calls(policy: UnifiedPolicy) -> None:
     job, done = Job(cameras=1, prompt_tokens=3, steps=1), []
     latency = measure_calls(policy, job, 1000, seconds=0.0, advance=lambda: done.append(1))
@@ -239,6 +243,7 @@ def test_the_barrier_kernel_compiles(arch: str, tmp_path: Path) -> None:
     assert b"turbopi_barriers" in compile_cubin(barrier.SOURCE, arch, {}, folder=tmp_path)
 
 
+@pytest.mark.slow
 def test_ready_is_measured_in_a_process_of_its_own() -> None:
     start = Start(None, "pi05_tiny", 0, None, "pytorch", "bf16", "cpu", 1, None)
     with empty_caches():
@@ -248,6 +253,7 @@ def test_ready_is_measured_in_a_process_of_its_own() -> None:
         assert one.imports > 0
 
 
+@pytest.mark.slow
 def test_a_start_that_fails_says_why() -> None:
     start = Start(None, "pi05_tiny", 0, None, "warp", "bf16", "cpu", 1, None)
     with pytest.raises(BackendError, match="unknown backend 'warp'"):
@@ -308,6 +314,7 @@ def test_on_a_cpu_the_matrix_rate_is_of_weights_as_the_model_keeps_them(monkeypa
     assert asked == [((16, 16), True)]
 
 
+@pytest.mark.slow
 def test_points_above_the_roofline_are_warned_about(
     tmp_path: Path, drawn: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,6 +341,7 @@ def test_points_above_the_roofline_are_warned_about(
     assert "above the roof" in roofline.get_legend().get_texts()[-1].get_text()
 
 
+@pytest.mark.slow
 def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     floors_of(monkeypatch, 1e15, 1e18)
     seen: list[dict[str, Any]] = []
@@ -370,6 +378,7 @@ def test_without_precisions_the_backends_own_is_measured(names: list[str], taken
     assert own_precision(names) == taken
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_complete_document(
     tmp_path: Path, drawn: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -423,6 +432,7 @@ def test_the_command_writes_a_complete_document(
     assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in told
 
 
+@pytest.mark.slow
 def test_a_run_that_is_ended_has_kept_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[Any] = []
 
@@ -461,6 +471,7 @@ def test_wrong_options_are_refused(arguments: list[str], message: str) -> None:
     assert message in result.output
 
 
+@pytest.mark.slow
 def test_a_backend_that_breaks_is_named_and_costs_no_other_result(monkeypatch: pytest.MonkeyPatch) -> None:
     from turbopi.bench import run as bench_run
 

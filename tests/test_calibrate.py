@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from cli_helpers import refusal, turbopi
-from conftest import golden_cases, golden_folder, golden_model
+from conftest import TWO_LAYERS, golden_cases, golden_folder, golden_model
 from file_helpers import no_room
 from torch import nn
 
@@ -22,7 +22,6 @@ from turbopi.calibrate.statistics import Histogram, collect
 from turbopi.checkpoint import random_checkpoint
 from turbopi.checkpoint.calibration import BESIDE, calibration_of, for_policy
 from turbopi.cli.options import PolicyOptions
-from turbopi.config import preset
 from turbopi.engine.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
 from turbopi.models.observation import ModelInputs
 from turbopi.models.pi0.layers import AdaRMSNorm
@@ -49,7 +48,9 @@ from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
-TINY = preset("pi05_tiny").model
+pytestmark = pytest.mark.usefixtures("two_layers")
+
+TINY = TWO_LAYERS.model
 
 
 @lru_cache
@@ -70,8 +71,8 @@ def made_up(**more: Any) -> Quantization:
 
 def test_every_product_has_a_site_and_the_last_prefix_layer_keys_and_values_alone() -> None:
     names = [str(site) for site in sites(TINY)]
-    assert len(names) == len(set(names)) == 6 * 4 + 5 * 4 + 1 + 6 * 4
-    assert [name for name in names if name.startswith("prefix.5")] == ["prefix.5.qkv"]
+    assert len(names) == len(set(names)) == 2 * 4 + 1 * 4 + 1 + 2 * 4
+    assert [name for name in names if name.startswith("prefix.1")] == ["prefix.1.qkv"]
 
 
 def test_a_site_of_odd_width_says_why_it_cannot() -> None:
@@ -179,6 +180,7 @@ def test_values_that_are_not_finite_are_refused_by_site() -> None:
 # What is chosen
 
 
+@pytest.mark.slow
 def test_sites_stay_in_bf16_until_the_target_is_met() -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
     own = golden_calls(case)
@@ -208,6 +210,7 @@ def test_actions_without_a_signal_are_not_calibrated_on(monkeypatch: pytest.Monk
         run._Trials(model, own, 1, 1, run.Progress(), RoundedWeights())
 
 
+@pytest.mark.slow
 def test_directions_more_than_halve_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
     settings, errors = Settings({}, target=0.0, batch=1, methods=("headroom",)), []
@@ -221,6 +224,7 @@ def test_directions_more_than_halve_the_error(monkeypatch: pytest.MonkeyPatch) -
         assert errors[0][name]["relative_rms"] < 0.8 * errors[1][name]["relative_rms"], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [("expert",), PARTS])
 def test_directions_more_than_halve_what_weights_alone_lose(parts: tuple[str, ...]) -> None:
     model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
@@ -246,6 +250,7 @@ def test_the_expert_is_weighed_as_the_whole_that_it_goes_as() -> None:
     assert by_harm(rms, work) == [("vision.out",), ("vision.fc2",), expert, ("prefix.down",)]
 
 
+@pytest.mark.slow
 def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("turbopi.calibrate.statistics.PERCENTILE", 90.0)  # a tenth of the values is beyond
     model, own = golden_model("pi05"), golden_calls(golden_cases()["b_third_masked"])
@@ -456,7 +461,7 @@ def test_a_file_for_int8_says_so_and_one_for_fp8_is_read_by_older_turbo_pis(tmp_
     read = Quantization.load(tmp_path / "q.json")
     assert read == int8 and read.identity == int8.identity != fp8.identity
     plan = read.plan(TINY, "int8")
-    assert plan.expert == "int8" and plan.kept.keys() == {"prefix.5.qkv"} and "no NaN" in plan.kept["prefix.5.qkv"]
+    assert plan.expert == "int8" and plan.kept.keys() == {"prefix.1.qkv"} and "no NaN" in plan.kept["prefix.1.qkv"]
     assert not fp8.plan(TINY, "fp8").kept, "whose NaN stays one"
     vision = read.only(["vision"]).plan(TINY, "int8")
     assert vision.kept["prefix.0.qkv"] == "INT8 is switched off in the prefix" and vision.expert == "bf16"
@@ -485,7 +490,7 @@ def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
     assert mlp.expert == "bf16"
     assert "feed-forward" in mlp.kept["vision.0.qkv"]
     one_kept = dict(made_up().sites)
-    one_kept["expert.3.out"] = dataclasses.replace(one_kept["expert.3.out"], kept="it hurts")
+    one_kept["expert.1.out"] = dataclasses.replace(one_kept["expert.1.out"], kept="it hurts")
     assert made_up(sites=one_kept).plan(TINY, "fp8").expert == "bf16"  # the kernel takes all of them or none
     vision = made_up().only(["vision"]).plan(TINY, "fp8")
     assert {name.split(".")[0] for name in vision.scales} == {"vision"}
@@ -498,9 +503,9 @@ def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
 
 def test_a_kept_site_is_described_with_its_reason() -> None:
     entries = dict(made_up().sites)
-    entries["vision.2.fc1"] = dataclasses.replace(entries["vision.2.fc1"], kept="it hurts")
+    entries["vision.1.fc1"] = dataclasses.replace(entries["vision.1.fc1"], kept="it hurts")
     described = made_up(sites=entries).plan(TINY, "fp8").describe()
-    assert described["vision.fc1"] == {"fp8": "layers 0, 1, 3, 4, 5", "bf16: it hurts": "layers 2"}
+    assert described["vision.fc1"] == {"fp8": "layers 0", "bf16: it hurts": "layers 1"}
     assert described["vision.fc2"] == "fp8"
 
 
@@ -594,6 +599,7 @@ def test_a_file_keeps_its_identity(tmp_path: Path) -> None:
 # Formats without kernels
 
 
+@pytest.mark.slow
 def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
     calibration = golden_calibration(golden_folder(), "pi0", torch.device("cpu"), 0.0)
     assert calibration.report["observations"]["source"] == "the golden cases themselves"
@@ -616,6 +622,7 @@ def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
 # The command
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Path) -> None:
     out = tmp_path / "tiny_fp8.json"
     quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
@@ -639,6 +646,7 @@ def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Pa
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments | {"precision": "bf16"})  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
     out = tmp_path / "int8.json"
     quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
@@ -653,12 +661,13 @@ def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
         "worst",
     }
     calibration = Quantization.load(out)
-    assert calibration.numbers == "int8" and calibration.plan(TINY, "int8").kept.keys() == {"prefix.5.qkv"}
-    assert str(calibration.sites["prefix.5.qkv"].kept).startswith("not possible: INT8 has no NaN")
+    assert calibration.numbers == "int8" and calibration.plan(TINY, "int8").kept.keys() == {"prefix.1.qkv"}
+    assert str(calibration.sites["prefix.1.qkv"].kept).startswith("not possible: INT8 has no NaN")
     said = refusal(turbopi("calibrate", "--random-weights", "pi05_tiny", "--precision", "bf16", "--out", out, *quick))
     assert "--precision 'bf16' isn't what calibration is for; choose fp8 or int8" in said
 
 
+@pytest.mark.slow
 def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(b"weights")
@@ -673,6 +682,7 @@ def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
     assert "there is no folder nowhere" in refusal(turbopi("calibrate", "nowhere", *quick))
 
 
+@pytest.mark.slow
 def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
     checkpoint = random_checkpoint("pi05_tiny")
     policy = UnifiedPolicy(shipped.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
@@ -688,6 +698,7 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     assert document.calibrated is not None and document.calibrated["observations"] == "x"
 
 
+@pytest.mark.slow
 def test_held_out_observations_that_are_none_are_warned_of(tmp_path: Path) -> None:
     policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu")
     call = RecordedCall(policy.example_observation(0), {"actions": np.zeros((10, 7))}, 0.0)

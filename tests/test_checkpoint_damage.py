@@ -85,6 +85,7 @@ def test_chunks_that_older_orbax_left_out_are_zeros_and_said_to_be(tmp_path: Pat
     assert not checkpoint.load("cpu", "f32").state["action_in_proj.weight"].any()
 
 
+@pytest.mark.slow
 def test_every_damaged_byte_of_an_orbax_index_is_found(tmp_path: Path) -> None:
     """Manifests and index nodes have a CRC-32C: no byte that is read may change what they say."""
     folder = tmp_path / "c"

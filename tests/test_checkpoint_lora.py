@@ -111,6 +111,7 @@ def test_what_was_merged_is_told_and_changes_the_fingerprint(merged: Checkpoint)
     assert merged.info()["parameters"] == base.info()["parameters"]
 
 
+@pytest.mark.slow
 def test_alpha_scales_attention_and_not_mlps(tree: Tree, adapted: Path, merged: Checkpoint, tmp_path: Path) -> None:
     base = open_checkpoint(GOLDEN / "pi05" / "jax", "pi05_libero")
 

@@ -20,6 +20,8 @@ from test_checkpoint_lora import with_adapters
 from turbopi.checkpoint import random_checkpoint, write_random
 from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, VisionConfig
 
+pytestmark = pytest.mark.slow
+
 MODEL = ModelConfig(
     vision=VisionConfig(width=144, depth=27, mlp_dim=538, num_heads=4),
     vlm=GemmaConfig(width=256, mlp_dim=2048, head_dim=32),

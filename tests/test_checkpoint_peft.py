@@ -280,6 +280,7 @@ def test_the_golden_adapter_is_as_lerobot_saves_it(folder: Path) -> None:
     assert json.loads((folder / CONFIG).read_text())["base_model_name_or_path"] == "lerobot/base"
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_value_in_the_adapters_config_is_followed_or_refused(folder: Path, data: st.DataObject) -> None:

@@ -76,6 +76,7 @@ def test_bf16_is_the_rounded_f32(tiny: Checkpoint) -> None:
         assert torch.equal(tensor, exact[name].to(tensor.dtype))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_has_its_shapes_and_statistics_of_its_robot(preset: str) -> None:
     checkpoint = random_checkpoint(preset)
@@ -111,6 +112,7 @@ def test_seeds_that_are_none_are_refused(seed: object) -> None:
         random_checkpoint("pi05_huge")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 def test_activations_stay_healthy_and_the_observation_matters(kind: str) -> None:
     config = PRESET.with_model(kind=kind)

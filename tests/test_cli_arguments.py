@@ -79,6 +79,7 @@ def test_numbers_that_cannot_be_meant_are_refused_before_any_work(arguments: tup
     assert arguments[-1].lstrip("-").split("-")[-1] in said or "steps" in said or "seed" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("inspect",), ("infer",), ("convert",), ("serve", "--port", "0")], ids=str)
 @pytest.mark.parametrize("kind", ["missing", "file", "folder", "loop", "long", "below a file", "empty", "odd bytes"])
 def test_what_is_no_checkpoint_is_named(command: tuple[str, ...], kind: str, tmp_path: Path) -> None:

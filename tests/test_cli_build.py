@@ -62,6 +62,7 @@ def test_engines_are_built_once_and_then_found(build: Callable[..., dict[str, An
     assert set(build("--rebuild")["engines"].values()) == {"built"}
 
 
+@pytest.mark.slow
 def test_fp8_engines_are_calibrated_on_real_pictures_and_the_scales_kept(
     build: Callable[..., dict[str, Any]],
 ) -> None:
@@ -73,6 +74,7 @@ def test_fp8_engines_are_calibrated_on_real_pictures_and_the_scales_kept(
     assert sum(name.endswith("-fp8") for name in document["engines"]) == 5
 
 
+@pytest.mark.slow
 def test_engines_of_another_calibration_are_refused_and_built_again(build: Callable[..., dict[str, Any]]) -> None:
     folder = Path(build("--precision", "fp8")["folder"])
     file = next(folder.glob("feed_forward-0-*.engine"))

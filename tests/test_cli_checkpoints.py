@@ -187,6 +187,7 @@ def test_inspect_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
     assert "is an address; Turbo-Pi reads local folders" in refusal(turbopi("inspect", "gs://openpi/pi05_libero"))
 
 
+@pytest.mark.slow
 def test_a_converted_folder_runs_like_the_weights_it_is_made_of(tiny: Path, tmp_path: Path) -> None:
     """But for the few weights that bf16 mode keeps in float32 and the folder has in bfloat16."""
     frame = load_frames()[0]

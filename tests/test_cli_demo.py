@@ -23,6 +23,8 @@ from turbopi.support.action_groups import action_groups
 from turbopi.support.errors import BackendError, TurboPiError
 from turbopi.verify import control, demo
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 
 def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
     return UnifiedPolicy(random_checkpoint(preset), backend="pytorch", precision="f32", num_denoising_steps=2)
@@ -46,6 +48,7 @@ def test_missing_pictures_are_said_to_be_missing(tmp_path: Path) -> None:
         shipped.load_frames(tmp_path)
 
 
+@pytest.mark.slow
 def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_expert(tmp_path: Path) -> None:
     result = turbopi("demo", "--frames", 2, "--report", tmp_path / "report", "--seed", 3, "--episodes", 0)
     assert result.exit_code == 0, result.output
@@ -83,6 +86,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
         assert np.asarray(picture.convert("L")).std() > 20
 
 
+@pytest.mark.slow
 def test_random_weights_are_said_to_be_random_and_held_to_the_closer_bound(tmp_path: Path) -> None:
     result = turbopi("demo", "--random-weights", "pi05_tiny", "--frames", 1, "--steps", 2, "--report", tmp_path)
     assert result.exit_code == 0, result.output
@@ -91,6 +95,7 @@ def test_random_weights_are_said_to_be_random_and_held_to_the_closer_bound(tmp_p
     assert "expert" not in result.stdout
 
 
+@pytest.mark.slow
 def test_episodes_that_are_asked_for_without_a_simulator_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
     def missing(self: LiberoSimulator) -> list[str]:
         raise SimulatorUnavailable("LIBERO isn't installed here")
@@ -113,6 +118,7 @@ def swapped_cameras(self: PyTorchBackend, observation: Observation, noise: torch
 RIGHT_SAMPLE = PyTorchBackend.sample
 
 
+@pytest.mark.slow
 def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(PyTorchBackend, "sample", swapped_cameras)
     result = turbopi("demo", "--frames", 1, "--steps", 2, "--report", tmp_path, "--json", "--episodes", 0)
@@ -160,6 +166,7 @@ def _for_robot(robot: str) -> UnifiedPolicy:
     return UnifiedPolicy(random_checkpoint(replace(tiny, robot=robot)), backend="pytorch")
 
 
+@pytest.mark.slow
 def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
     oracle = tiny_oracle()
     observed = shipped.observations(oracle, shipped.load_frames()[:1])
@@ -184,6 +191,7 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
         judged(exact[0][:9])
 
 
+@pytest.mark.slow
 def test_a_fault_in_one_of_several_frames_fails_the_check() -> None:
     """Faults make 73 times the control and more: seven times the bound, in one of six frames nearly three times."""
     oracle = tiny_oracle()
@@ -195,6 +203,7 @@ def test_a_fault_in_one_of_several_frames_fails_the_check() -> None:
     assert not judged.ok and judged.all_frames.rms == pytest.approx(7.3 * bound / np.sqrt(6), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
     oracle = tiny_oracle()
     observed = shipped.observations(oracle, shipped.load_frames()[:2])

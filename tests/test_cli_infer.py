@@ -18,6 +18,8 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 from turbopi.recordings import RecordedCall, save_call
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
 
 
@@ -61,6 +63,7 @@ def actions_in(tmp_path: Path) -> np.ndarray:
         return actions
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_the_earlier_actions_and_plot(
     npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +123,7 @@ def test_a_folder_with_pictures_gives_the_same_as_their_arrays(npz: Path, tmp_pa
     np.testing.assert_array_equal(actions_in(tmp_path), expected)
 
 
+@pytest.mark.slow
 def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: Path, drawn: list[Any]) -> None:
     result = infer(tmp_path, recording, "--seed", 5, "--plot", tmp_path / "all.pdf")
     chunks = actions_in(tmp_path)
@@ -154,6 +158,7 @@ def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Pat
     assert (folder / "table.png").read_bytes() == b"picture"
 
 
+@pytest.mark.slow
 def test_noise_from_a_file_is_what_the_model_starts_from(npz: Path, tmp_path: Path) -> None:
     infer(tmp_path, npz, "--seed", 5, "--no-plot")
     expected = actions_in(tmp_path)

@@ -26,6 +26,7 @@ def turbopi(*arguments: str, **environment: str) -> "subprocess.CompletedProcess
     return subprocess.run([*TURBOPI, *arguments], capture_output=True, timeout=200, env=os.environ | environment)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("environment", ENCODINGS, ids=str)
 @pytest.mark.parametrize("arguments", [["infer", "--help"], ["serve", "--help"], ["--help"]], ids=" ".join)
 def test_help_comes_out_whatever_the_encoding(arguments: list[str], environment: dict[str, str]) -> None:
@@ -73,6 +74,7 @@ def until_closed(*arguments: str) -> tuple[int, bytes]:
     return result.returncode, result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -107,6 +109,7 @@ def test_a_broken_pipe_that_is_not_the_output_is_no_quiet_end() -> None:
     assert b"BrokenPipeError" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", [["--version"], ["inspect", "--random-weights", "pi05_tiny"]], ids=" ".join)
 def test_a_full_disk_behind_the_output_is_one_line(arguments: list[str]) -> None:
@@ -173,6 +176,7 @@ def test_ctrl_c_ends_the_process_with_130(moment: str) -> None:
     assert b"Fatal" not in errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [b"", b"RANDOM WEIGHTS", b"GB of weights", b"loading random"], ids=repr)
 def test_ctrl_c_while_a_full_size_model_is_loaded_is_130(after: bytes) -> None:
     """In a terminal, with a progress bar, after what the command has printed."""

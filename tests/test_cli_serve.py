@@ -71,6 +71,7 @@ def wait_for_url(process: "subprocess.Popen[str]", printed: list[str]) -> str:
     raise AssertionError(f"the server ended, or didn't serve in 120 s: {printed} {process.stderr.read()}")
 
 
+@pytest.mark.slow
 def test_a_client_gets_actions_and_ctrl_c_stops(tmp_path: Path) -> None:
     frame = load_frames()[0]
     observation: dict[str, Any] = {
@@ -219,8 +220,9 @@ def test_a_port_is_ready_once_every_number_of_cameras_is_warm(monkeypatch: pytes
         assert sorted(warm) == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
-    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY[:2], "--steps", "300", "--port", "0"]
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY[:2], "--steps", "100", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

@@ -17,6 +17,8 @@ from turbopi.cli.framework import Output
 from turbopi.cli.tables import fitted
 from turbopi.robots import create_robot
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 WORDS = st.text("abcdefghij", min_size=1, max_size=12)
 NUMBERS = st.floats(-1e5, 1e5).map(lambda number: f"{number:+.4f}")
 
@@ -85,6 +87,7 @@ def test_a_wide_table_comes_in_parts_with_its_sections_and_styles() -> None:
 TINY = ("--random-weights", "pi05_tiny")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -111,6 +114,7 @@ def test_commands_cut_nothing_at_eighty_columns(
     nothing_is_cut(*with_tables(monkeypatch, *words))
 
 
+@pytest.mark.slow
 def test_the_tables_of_eval_and_compare_are_whole_at_eighty_columns(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

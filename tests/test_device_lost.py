@@ -19,6 +19,8 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.support.errors import BackendError, BackendUnavailable, DeviceLost, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 ILLEGAL = "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported"
 
@@ -121,6 +123,7 @@ def test_every_way_to_call_finds_it_out(call: str) -> None:
     assert backend.calls == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error",
     [
@@ -220,6 +223,7 @@ def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None
     assert policy.lost is not None and "layer 3 for queries" in policy.lost
 
 
+@pytest.mark.slow
 def test_it_holds_without_asserts() -> None:
     code = (
         "import torch\nfrom turbopi.backends.device_lost import Guard\nfrom turbopi.support.errors import DeviceLost\n"

@@ -12,6 +12,8 @@ from cli_helpers import turbopi
 
 from turbopi.cli import app
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 GROUP = typer.main.get_command(app)
@@ -84,6 +86,7 @@ def needs_nothing(words: list[str]) -> bool:
     return words in (["backends"], ["doctor"]) or "pi05_tiny" in words or reckons
 
 
+@pytest.mark.slow
 def test_commands_that_need_no_checkpoint_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tutorial's run in tests/test_tutorial.py."""
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,7 @@
 """docs/gpus.md says of each GPU what the backends, the checked-in results and the predictions say."""
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,11 @@ TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
 GPUS_ASKED_FOR = ("rtx4090", "rtx5090", "l40s", "a100", "orin", "thor", "h100", "h200")  # issues and users name them
 
 
+@lru_cache
+def table() -> list[str]:
+    return tables.gpus()
+
+
 def cells(lines: list[str], name: str) -> dict[str, str]:
     """A row of a table, by its heads."""
     heads = [head.strip() for head in lines[0].split("|")[1:-1]]
@@ -32,7 +38,7 @@ def cells(lines: list[str], name: str) -> dict[str, str]:
 def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The registry is asked by another way than the table's own."""
     gpu = find_gpu(key)
-    row = cells(tables.gpus(), gpu.name)
+    row = cells(table(), gpu.name)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: gpu.capability)
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: object())
     monkeypatch.setattr("shutil.which", lambda name, *rest: f"/usr/bin/{name}")
@@ -59,11 +65,12 @@ def test_every_gpu_asked_for_has_its_rows() -> None:
 def test_only_what_a_checked_in_result_names_was_run() -> None:
     checked = [json.loads(file.read_text()) for file in tables.RESULTS.glob(tables.TESTED)]
     names = " ".join(one["provenance"]["gpu"]["name"].lower() for one in checked if one["ok"])
+    measured = {call.gpu for call in measured_calls()}
     for gpu in published_gpus().values():
-        said = cells(tables.gpus(), gpu.name)["run"]
+        said = cells(table(), gpu.name)["run"]
         tested = gpu.key in names.split()
         assert ("GPU tests" in said) == tested
-        assert ("speed" in said) == any(call.gpu == gpu.key for call in measured_calls())
+        assert ("speed" in said) == (gpu.key in measured)
 
 
 def test_a_failed_check_is_no_run(tmp_path: Path) -> None:
@@ -102,12 +109,13 @@ def test_cases_run_as_ptx_count_for_their_gpu_and_newer_ones(tmp_path: Path) -> 
 
 def test_predictions_are_of_the_backend_that_runs_there() -> None:
     assert "are **predictions**" in TEXT
+    rows, measured = tables.gpu_predictions(), {call.gpu for call in measured_calls()}
     for gpu in published_gpus().values():
-        row, taken = cells(tables.gpu_predictions(), gpu.name), tables.runs(gpu)
+        row, taken = cells(rows, gpu.name), tables.runs(gpu)
         by_precision = {one.precision: one for one in predict(gpu, ModelConfig(), Job())}
         assert row["bf16 floor"] == f"{by_precision['bf16'].floor_ms['total']:.1f}"
         assert bool(row["FP8 floor"]) == ("fp8" in by_precision)
-        assert ("measured" in row["bf16 call"]) == (gpu.key in {call.gpu for call in measured_calls()})
+        assert ("measured" in row["bf16 call"]) == (gpu.key in measured)
         if taken["fp8"] == "no":
             assert row["FP8 call"] == ""
 

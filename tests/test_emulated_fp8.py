@@ -57,6 +57,7 @@ def actions(backend: backends.Backend) -> Tensor:
     return backend.sample(case.observation, case.noise, STEPS).actions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier", TIERS)
 def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     case, model = golden_cases()[CASE], golden_model("pi05")
@@ -73,6 +74,7 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     assert 1e-3 < float((ours[0] - exact).norm() / exact.norm()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
 def test_golden_cases_hold(numbers: Numbers, monkeypatch: pytest.MonkeyPatch) -> None:
     def known(folder: GoldenFolder, kind: Kind, device: torch.device, format: Format) -> Quantization:
@@ -99,6 +101,7 @@ def test_in_int8_the_experts_activations_stay_and_products_err_less_than_in_fp8(
     assert model.config.expert.depth * 4 == len(experts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier", ["fp8", "int8"])
 def test_damage_is_refused_and_harms_no_other_observation(tier: Tier) -> None:
     """A NaN in what one prompt alone has; then one, in INT8 an infinity too, where rounding would hide it."""
@@ -172,21 +175,22 @@ def test_auto_never_takes_it() -> None:
         assert backends.choose(CPU, tier)[0] == "fused"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
-def test_verify_and_bench_run_it(numbers: str, tmp_path: Path) -> None:
-    small = "src/turbopi/data/small_policy"
+def test_verify_and_bench_run_it(two_layers: None, numbers: str, tmp_path: Path) -> None:
+    tiny = ("--random-weights", "pi05_tiny")
     file, backend = tmp_path / "calibration.json", f"emulated_{numbers}"
     noise = ("--observations", "random-noise", "--count", 2, "--steps", 2)
-    made = turbopi("calibrate", small, "--precision", numbers, *noise, "--out", file)
+    made = turbopi("calibrate", *tiny, "--precision", numbers, *noise, "--out", file)
     assert made.exit_code == 0, made.output
     options = ("--precisions", numbers, "--quantization", file, "--device", "cpu", "--json")
     few = ("--count", 1, "--noises", 1, "--steps", 2)
-    verified = turbopi("verify", small, "--backend", backend, "--precision", numbers, *few, *options[2:])
+    verified = turbopi("verify", *tiny, "--backend", backend, "--precision", numbers, *few, *options[2:])
     document = json.loads(verified.stdout)
     assert verified.exit_code == (0 if document["ok"] else 1), verified.output
     assert (document["backend"], document["precision"]) == (backend, numbers)
     assert document["actions"]["relative_rms"] > 0, "nothing was rounded"
     quick = ("--calls", 1, "--main-calls", 1, "--steps", 1, "--no-error")
-    benched = turbopi("bench", small, "--backends", backend, *quick, *options)
+    benched = turbopi("bench", *tiny, "--backends", backend, *quick, *options)
     assert benched.exit_code == 0, benched.output
     assert json.loads(benched.stdout)["results"][0]["precision"] == numbers

@@ -188,6 +188,7 @@ def test_gelu_by_sigmoid_is_gelu(dtype: torch.dtype) -> None:
     torch.testing.assert_close(geglu_by_sigmoid(x), geglu(x), atol=atol, rtol=rtol)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # the compiler's own
 @pytest.mark.skipif(
     backends.availability("pytorch_compile", CPU) is not None, reason="torch.compile needs a C++ compiler"

@@ -162,6 +162,7 @@ IN_THE_INTERPRETER = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("times", [pytest.param(one, marks=IN_THE_INTERPRETER) for one in ("one time", "by token")])
 def test_kernels_for_few_tokens_equal_autograd(kind: Kind, times: Times) -> None:
@@ -227,6 +228,7 @@ def in_rows(expert: Expert) -> Expert:
     return dataclasses.replace(expert, table=by_time.movedim(0, 2), rows=rows.flip(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("times", "kernels"),
     [("one time", False), ("by token", False), pytest.param("by token", True, marks=IN_THE_INTERPRETER)],
@@ -268,6 +270,7 @@ def test_the_suffixs_own_keys_and_values_carry_gradient(kind: Kind, broken: Call
     assert relative(cut, whole) > 1e-4, "ten times what the comparison with autograd lets pass"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # the compiler's own
 @pytest.mark.skipif(
     backends.availability("pytorch_compile", torch.device("cpu")) is not None,

@@ -128,6 +128,7 @@ def batched(
     return loop
 
 
+@pytest.mark.slow
 def test_each_observation_gets_what_it_gets_alone(kind: Kind) -> None:
     """Other cameras, prompts of other lengths, one without a picture, one without a prompt, and an empty place."""
     observation, noise = observations(kind, [2, 0, 3, 1], [7, 12, 3, 0], horizon=5)
@@ -190,6 +191,7 @@ class TestBackend:
     def backend(self) -> OnCpu:
         return on_cpu()
 
+    @pytest.mark.slow
     def test_any_number_of_observations(self, backend: OnCpu) -> None:
         made, noise = observations("pi05", [2, 0, 3, 1, 2, 2, 1], [7, 12, 3, 1, 5, 5, 9], horizon=5)
         exact = golden_model("pi05").sample(made, noise, 2)
@@ -230,6 +232,7 @@ class TestBackend:
         assert torch.equal(trace["actions"], backend.sample(made, noise, 2).actions)
         assert backend.describe()["batches"] == []
 
+    @pytest.mark.slow
     def test_strict_takes_what_is_captured(self, backend: OnCpu) -> None:
         backend.strict = True
         four, noise = observations("pi05", [2, 2, 2, 2], [7, 12, 3, 1], horizon=5)

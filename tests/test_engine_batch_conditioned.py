@@ -55,6 +55,7 @@ def close(ours: Tensor, exact: Tensor) -> None:
     torch.testing.assert_close(ours, exact, atol=2e-5, rtol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", BY_TOKEN)
 def test_every_form_by_token_runs_in_one_call_beside_plain_observations(engine: OnCpu, which: str) -> None:
     """Other cameras, prompts of other lengths, one without a picture, one without a prompt."""
@@ -68,6 +69,7 @@ def test_every_form_by_token_runs_in_one_call_beside_plain_observations(engine: 
     assert len(engine.told) == 3, "vision, prefix and denoising of all four"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", JACOBIAN)
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_the_true_jacobian_goes_back_through_each_observations_own_prefix(
@@ -83,6 +85,7 @@ def test_the_true_jacobian_goes_back_through_each_observations_own_prefix(
     assert len(engine.told) == 3
 
 
+@pytest.mark.slow
 def test_rows_of_all_forms_are_grouped_by_what_may_share_a_loop_and_come_back_in_their_order(engine: OnCpu) -> None:
     kind = engine.config.kind
     made, noise = observations(kind, [1, 2, 0, 1, 1, 2, 1], [3, 5, 7, 2, 4, 6, 8], H)
@@ -95,6 +98,7 @@ def test_rows_of_all_forms_are_grouped_by_what_may_share_a_loop_and_come_back_in
     assert engine.told == ["run"] * 6 + ["run", "answer"], "four by token; two guided ones; the solver's alone"
 
 
+@pytest.mark.slow
 def test_one_loop_serves_observations_whose_times_differ(engine: OnCpu) -> None:
     kind = engine.config.kind
     made, noise = observations(kind, CAMERAS, TOKENS, H)
@@ -118,6 +122,7 @@ def test_held_actions_come_out_as_they_were_given(engine: OnCpu, which: str) -> 
         np.testing.assert_array_equal(actions[one.held], one.values[one.held])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["held_and_identity", "jacobian"])
 def test_what_another_observation_asks_for_changes_nothing(engine: OnCpu, which: str) -> None:
     made, noise = observations(engine.config.kind, CAMERAS, TOKENS, H)
@@ -130,6 +135,7 @@ def test_what_another_observation_asks_for_changes_nothing(engine: OnCpu, which:
         assert torch.equal(before[row], after[row])
 
 
+@pytest.mark.slow
 def test_a_batch_that_asks_for_nothing_is_the_plain_one_to_the_last_bit(engine: OnCpu) -> None:
     made, noise = observations(engine.config.kind, CAMERAS, TOKENS, H)
     plain = engine.sample(made, noise, STEPS).actions
@@ -140,6 +146,7 @@ def test_a_batch_that_asks_for_nothing_is_the_plain_one_to_the_last_bit(engine: 
     assert len(engine._batches._graphs) == captured
 
 
+@pytest.mark.slow
 def test_what_is_held_and_what_pulls_changes_without_a_new_capture_and_ends_with_its_call(engine: OnCpu) -> None:
     kind = engine.config.kind
     made, noise = observations(kind, CAMERAS, TOKENS, H)
@@ -172,6 +179,7 @@ def test_intermediates_of_golden_cases(name: str, which: list[str | None]) -> No
     assert len(backend.describe()["batches"]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian"])
 def test_bfloat16_is_as_close_to_float32_as_the_reference_is(which: str) -> None:
     case = golden_cases()["b_third_masked"]

@@ -51,6 +51,7 @@ def watched(run: Callable[..., None]) -> Callable[..., None]:
     return captured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 @pytest.mark.parametrize("rows", [1, 3])
 @pytest.mark.parametrize("which", ["plain", "ab2", "staircase", "held_and_identity", "jacobian_and_held"])

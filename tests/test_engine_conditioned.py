@@ -34,6 +34,7 @@ def expected(kind: Kind, observation: Observation, noise: Tensor, asked: Any, st
     return golden_model(kind).sample(observation, noise, steps, conditioning=asked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", FORMS)
 def test_every_form_equals_the_reference(engine: OnCpu, which: str) -> None:
     observation, noise = made_up(engine.config.kind, 2, 19)
@@ -121,6 +122,7 @@ def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(ki
         fresh.denoise(long, noise, STEPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian"])
 def test_bfloat16_is_as_close_to_float32_as_the_reference_is(which: str) -> None:
     case = golden_cases()["b_third_masked"]

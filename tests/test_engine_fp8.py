@@ -112,6 +112,7 @@ def damages(weights: Weights) -> dict[str, Tensor]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [*FORMATS, "f32"])
 def test_damage_anywhere_reaches_the_actions_and_goes_with_it(numbers: str) -> None:
     model, (observation, noise) = golden_model("pi05"), made_up("pi05", 1, 5)
@@ -287,6 +288,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     assert packed.numbers == "int8" and bool((packed.inputs == 1).all())
 
 
+@pytest.mark.slow
 def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
     backend = fused(CPU, whole_calibration())
     refused: dict[User, Any] = {

@@ -86,6 +86,7 @@ class TestPrefix:
 class TestAdded:
     """Operations that add a product to the residual stream themselves, in place."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("most", [MOST_ROWS, 64])
     @pytest.mark.parametrize("every", [1, 2])
     def test_a_batchs_keys_and_values_stay(self, most: int, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,6 +209,7 @@ class TestPictures:
         assert bool(found[0].isfinite().all()) and torch.equal(*found)
 
     # the operation that stands in for the device's is openpi's way
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("cut", "cls", "resize"),
         [(1, OnCpu, "openpi"), (3, OnCpu, "lerobot"), (1, Resizing, "openpi")],
@@ -261,6 +263,7 @@ class TestPictures:
         with pytest.raises(AssertionError, match="5 things to do before 4 graphs"):
             graph.launch(*[lambda: None] * 5)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("cut", [1], indirect=True)
     def test_a_wrong_picture_of_a_later_part_leaves_the_next_call_right(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(call, "PART", 2)

@@ -21,6 +21,8 @@ from turbopi.evaluate.sources import LocalPolicy
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.support.errors import ActionError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 H = 10
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none --max-steps 3"
 
@@ -110,6 +112,7 @@ def policy(request: pytest.FixtureRequest) -> UnifiedPolicy:
     return trained_policy(request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_a_request_alone_is_bit_for_bit_what_infer_gives(policy: UnifiedPolicy, mode: JoinMode) -> None:
     observation, previous = policy.example_observation(), chunk(7, mode)
@@ -119,6 +122,7 @@ def test_a_request_alone_is_bit_for_bit_what_infer_gives(policy: UnifiedPolicy, 
     assert np.array_equal(answer.for_next["model_actions"], expected["model_actions"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_rows_of_a_batch_have_their_own_chunk_and_seed(policy: UnifiedPolicy, mode: JoinMode) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
@@ -130,6 +134,7 @@ def test_rows_of_a_batch_have_their_own_chunk_and_seed(policy: UnifiedPolicy, mo
         np.testing.assert_allclose(answer.for_next["model_actions"], expected["model_actions"], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [None, "rtc", "rtc_identity", "rtc_trained"])
 def test_after_warm_up_no_batch_of_the_run_captures_anything(mode: JoinMode | None) -> None:
     policy = trained_policy(Uncaptured)

@@ -18,6 +18,8 @@ from turbopi.sim import libero
 from turbopi.support.errors import ConfigError
 from turbopi.support.installation import install_command
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none"
 
 
@@ -97,6 +99,7 @@ def test_a_server_is_evaluated(tmp_path: Path) -> None:
     assert "task 1, initial state 0: success" in result.stdout and "100.0 % [20.7, 100.0]" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_foreign_label_is_printed_as_it_is(tmp_path: Path) -> None:
     """And isn't taken for the terminal's markup, which would end the command after the run."""
     policy = SeekingPolicy()
@@ -112,6 +115,7 @@ def test_a_foreign_label_is_printed_as_it_is(tmp_path: Path) -> None:
     assert "[/red]" in result.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("seeking")
 def test_crashes_give_exit_code_1(tmp_path: Path) -> None:
     command = f"eval evaluate_fakes:TroubledSimulator {QUICK} --tasks 0 --initial-states 0,3 --max-steps 5"
@@ -137,6 +141,7 @@ def test_a_simulator_in_the_current_folder_is_found_by_the_installed_command(
     assert "task 0, initial state 0: failure after 5 steps" in result.stdout
 
 
+@pytest.mark.slow
 def test_compare_runs_each_way_with_the_same_noise(tmp_path: Path) -> None:
     command = f"compare pytorch:f32:1 pytorch:bf16:1 --simulator reacher {QUICK} --tasks 0 --trials 1 --max-steps 5"
     result = turbopi(command, "--out", tmp_path, "--json")
@@ -205,6 +210,7 @@ def test_anothers_file_is_not_replaced(file: str, command: str, tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == [file]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("seeking")
 def test_ways_beside_an_earlier_run_leave_its_pages_as_they_are(tmp_path: Path) -> None:
     """Unless --out is given, one way and several have the same folder."""

@@ -24,6 +24,8 @@ from turbopi.sim import create
 from turbopi.sim.base import Task
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 TASK = Task(0, "count", "count", 10, 30)
 
 
@@ -130,6 +132,7 @@ def test_a_run_under_delay_is_another_run_and_an_old_one_is_still_continued(tmp_
         run(tmp_path, SeekingPolicy(), states=(0,), execution="async", delay=2)
 
 
+@pytest.mark.slow
 def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
     cells = make_cells(["sync", "async"], [4, 0], [5])
     assert [cell.delay for cell in cells] == [0, 4, 0, 4]
@@ -226,6 +229,7 @@ def test_what_the_policy_cannot_do_is_refused_before_its_weights_are_loaded(
     assert why in refused(f"eval chase --random-weights pi05_tiny {options}", "--out", tmp_path / "never")
 
 
+@pytest.mark.slow
 def test_the_command_runs_every_cell_and_compares_them(tmp_path: Path) -> None:
     from turbopi.policy.shipped import CHASE_POLICY
 

@@ -22,6 +22,8 @@ from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
 from turbopi.evaluate.visited import Visited, action_error
 from turbopi.support.errors import ConfigError, OutputError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 GROUPS = chunk_groups("libero", 7)
 
 
@@ -56,6 +58,7 @@ def test_a_film_has_the_simulations_speed(tmp_path: Path) -> None:
         assert film.count_frames() == 8 * 2 + 12  # each twice, the last one for another 1.5 s
 
 
+@pytest.mark.slow
 def test_failures_and_a_sample_of_successes_are_filmed(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="pip install 'imageio[ffmpeg]'")
     results = run(tmp_path, SeekingPolicy({0: "nan"}), states=(0, 1, 2, 3), videos=VideoPlan(successes=2))
@@ -105,6 +108,7 @@ def with_evil_text(value: Any, name: str = "") -> Any:
     return value if name in ("format", "complete", "status") or isinstance(value, int | float) else EVIL
 
 
+@pytest.mark.slow
 def test_foreign_text_is_escaped_wherever_a_page_shows_it(tmp_path: Path) -> None:
     for name, policy in (("a", SeekingPolicy()), ("b", SeekingPolicy({0: "nan"}))):
         run(tmp_path / name, policy, states=(0, 1))
@@ -130,6 +134,7 @@ def test_pages_are_escaped_whatever_a_results_object_holds(tmp_path: Path) -> No
     assert "<script" not in write_report(results).read_text()
 
 
+@pytest.mark.slow
 def test_dollars_in_a_label_are_no_formula(tmp_path: Path) -> None:
     policies = SeekingPolicy(), SeekingPolicy()
     for policy in policies:
@@ -138,6 +143,7 @@ def test_dollars_in_a_label_are_no_formula(tmp_path: Path) -> None:
     assert all(path.is_file() for path in write_comparison(tmp_path, compare(runs)))
 
 
+@pytest.mark.slow
 def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
     first = run(tmp_path / "a", SeekingPolicy(), states=(0, 1, 2, 3))
     second = run(tmp_path / "b", SeekingPolicy({0: "nan"}), states=(0, 1, 2))
@@ -155,6 +161,7 @@ def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
     assert "aborted" in written[2].read_text()
 
 
+@pytest.mark.slow
 def test_a_comparison_tells_the_precision_and_calibration_on_noise(tmp_path: Path) -> None:
     exact, rounded = SeekingPolicy(), SeekingPolicy()
     exact.metadata["precision"], rounded.metadata["precision"] = "f32", "fp8"
@@ -171,6 +178,7 @@ def in_fp8(calibration: str) -> SeekingPolicy:
     return policy
 
 
+@pytest.mark.slow
 def test_runs_of_two_calibrations_are_only_compared_on_purpose(tmp_path: Path) -> None:
     policies = {"exact": SeekingPolicy(), "one": in_fp8("aaaaaaaaaaaa"), "other": in_fp8("bbbbbbbbbbbb")}
     exact, one, other = (run(tmp_path / name, policy, states=(0,)) for name, policy in policies.items())
@@ -182,6 +190,7 @@ def test_runs_of_two_calibrations_are_only_compared_on_purpose(tmp_path: Path) -
     assert [run.document.calibration for run in compared] == [None, "aaaaaaaaaaaa", "bbbbbbbbbbbb"]
 
 
+@pytest.mark.slow
 def test_what_servers_tell_stands_for_their_weights(tmp_path: Path) -> None:
     one, other = (run(tmp_path / name, in_fp8(name * 12), states=(0,)) for name in "ab")
     for results, config in ((one, "pi05_base"), (other, "pi05_libero")):
@@ -194,6 +203,7 @@ def test_what_servers_tell_stands_for_their_weights(tmp_path: Path) -> None:
         compare([one, other])
 
 
+@pytest.mark.slow
 def test_a_run_is_not_continued_with_another_calibration(tmp_path: Path) -> None:
     run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0,))
     run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0, 1))
@@ -201,6 +211,7 @@ def test_a_run_is_not_continued_with_another_calibration(tmp_path: Path) -> None
         run(tmp_path, in_fp8("bbbbbbbbbbbb"), states=(0, 1))
 
 
+@pytest.mark.slow
 def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:
     first = run(tmp_path / "a", SeekingPolicy(), states=(0,))
     second = run(tmp_path / "b", SeekingPolicy(), states=(0,), replan=3)

@@ -141,6 +141,7 @@ WRONG: tuple[Any, ...] = (
 )
 
 
+@pytest.mark.slow
 def test_any_wrong_value_at_any_place_is_refused_or_harms_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

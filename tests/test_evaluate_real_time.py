@@ -26,6 +26,8 @@ from turbopi.sim import create
 from turbopi.sim.base import Task
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 HZ, STEP = 20.0, 1 / 20
 TASK = Task(0, "count", "count", 10, 60)
 OFFERED = {"modes": ["rtc", "rtc_identity", "rtc_trained"], "trained_max_delay": 4}
@@ -398,6 +400,7 @@ def test_a_film_shows_what_was_carried_out() -> None:
 # --- a whole run ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_in_real_time_is_another_run_and_says_what_it_measured(tmp_path: Path) -> None:
     assert "control_hz" not in protocol_json(Protocol("reacher", "reacher_colors"))
     cells = make_cells(["async", "sync"], [None], [4])
@@ -493,6 +496,7 @@ def test_compare_refuses_what_it_would_not_do() -> None:
     assert result.exit_code == 2 and "--execution, --real-time: ways to join chunks" in " ".join(result.stderr.split())
 
 
+@pytest.mark.slow
 def test_the_command_runs_in_real_time(tmp_path: Path) -> None:
     from turbopi.policy.shipped import CHASE_POLICY
 

@@ -18,6 +18,8 @@ from turbopi.policy.shipped import CHASE_POLICY
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 RTC = ("rtc", "rtc_identity", "rtc_trained")
 STATES = (0, 1)
 
@@ -59,6 +61,7 @@ def server(policy: UnifiedPolicy) -> Iterator[serve.PolicyServer]:
         yield running
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["async", *RTC])
 def test_a_server_gives_the_same_actions_as_the_policy_in_this_process(
     way: str, policy: UnifiedPolicy, server: serve.PolicyServer, tmp_path: Path

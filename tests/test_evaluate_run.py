@@ -24,6 +24,8 @@ from turbopi.sim.base import Task
 from turbopi.support.errors import ActionError, ConfigError, OutputError, TurboPiError
 from turbopi.support.files import alone_in
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 TROUBLED = "evaluate_fakes:TroubledSimulator"
 
 
@@ -46,6 +48,7 @@ def test_a_policy_that_sees_solves_every_episode(tmp_path: Path) -> None:
     assert results.complete and load_results(tmp_path).summary() == results.summary()
 
 
+@pytest.mark.slow
 def test_workers_requests_are_batched_which_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = gathering(monkeypatch, tmp_path / "gather", 3)
 
@@ -89,6 +92,7 @@ def test_the_step_limit_ends_an_episode_as_a_failure(tmp_path: Path) -> None:
     assert results.summary().success.wilson95[1] == pytest.approx(0.6576, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_crash_is_no_failure_and_is_tried_again(tmp_path: Path) -> None:
     states = (0, TroubledSimulator.RAISES, TroubledSimulator.DIES, 5)
     results = run(tmp_path, SeekingPolicy(), simulator=TROUBLED, states=states)
@@ -104,12 +108,14 @@ def test_a_crash_is_no_failure_and_is_tried_again(tmp_path: Path) -> None:
     assert again.episodes[0, 3].status == "crash" and not policy.batches  # only the crashed one was run
 
 
+@pytest.mark.slow
 def test_a_simulator_that_always_crashes_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(TooManyCrashes, match="crashed 5 times in a row; the last time: RuntimeError: no such scene"):
         run(tmp_path, SeekingPolicy(), simulator="evaluate_fakes:BrokenSimulator", states=range(9))
     assert load_results(tmp_path).summary().crashes == 5
 
 
+@pytest.mark.slow
 def test_a_simulator_that_cannot_draw_ends_the_run_at_once(tmp_path: Path) -> None:
     with pytest.raises(SimulatorUnavailable, match="can't draw with egl here"):
         run(tmp_path, SeekingPolicy(), simulator="evaluate_fakes:BlindSimulator")
@@ -220,6 +226,7 @@ def hold(folder: Path, ready: Any, done: Any) -> None:
         done.wait(120)
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_folder_dont_lose_each_others_results(tmp_path: Path) -> None:
     run(tmp_path, SeekingPolicy(), states=(0,))
     before = (tmp_path / "results.json").read_bytes()

@@ -21,6 +21,8 @@ from turbopi.sim.base import observation_problem
 from turbopi.sim.reacher import ReacherSimulator
 from turbopi.support.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 
 @pytest.fixture(autouse=True)
 def _no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,6 +39,7 @@ def statuses(results: Results) -> list[str]:
     return [episode.status for episode in results.in_order()]
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_while_its_request_waits_costs_its_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,6 +90,7 @@ def test_a_worker_that_dies_between_two_episodes_costs_the_next_one(tmp_path: Pa
     assert "exit code -9" in (results.in_order()[1].message or "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("execution", ["sync", "real time"])
 def test_a_state_that_is_nan_is_its_episodes_crash_and_the_others_go_on(execution: str, tmp_path: Path) -> None:
     own: dict[str, Any] = {} if execution == "sync" else {"execution": "async", "control_hz": 200.0}

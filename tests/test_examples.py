@@ -15,6 +15,8 @@ from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
 from turbopi.serve import running
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 STAND_IN = ROOT / "tests" / "openpi_stand_in"

@@ -233,6 +233,7 @@ def write_often(file: Path, number: int) -> None:
         write_whole(file, str(number) * 20_000)
 
 
+@pytest.mark.slow
 def test_of_many_writers_at_once_none_fails_and_readers_find_a_whole_file(tmp_path: Path) -> None:
     file = tmp_path / "shared"
     write_often(file, 9)
@@ -332,6 +333,7 @@ def disk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str
     return str(request.param)
 
 
+@pytest.mark.slow
 def test_a_second_writer_is_refused_with_the_first_ones_process(tmp_path: Path, disk: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, done = spawn.Event(), spawn.Event()
@@ -348,6 +350,7 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(tmp_path: Path, 
     assert names(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_no_lock(tmp_path: Path, disk: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, done = spawn.Event(), spawn.Event()
@@ -459,6 +462,7 @@ def append_often(file: Path, number: int) -> None:
         append_line(file, json.dumps({"number": number, "text": str(number) * 5000}))
 
 
+@pytest.mark.slow
 def test_several_processes_may_append_to_one_file(tmp_path: Path) -> None:
     file = tmp_path / "index.jsonl"
     with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:

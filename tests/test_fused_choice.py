@@ -151,6 +151,7 @@ def test_the_kernel_and_the_operations_give_the_references_actions(kernels: type
     assert [kernel.launches > 0 for kernel in kernels.made] == ([] if refused else [True])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", BY_TOKEN)
 def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[TwinKernel], which: str) -> None:
     backend, case = fused(), golden_cases()["b_third_masked"]
@@ -162,6 +163,7 @@ def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[TwinKernel],
     assert told == "one CUDA kernel" and call.startswith("H=10, 3 steps, by token, ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["kernel", "refused", "operations"])
 def test_the_true_jacobian_goes_forward_in_a_kernel_and_back_by_operations_that_find_the_expert_there(
     kernels: type[TwinKernel], how: str, monkeypatch: pytest.MonkeyPatch

@@ -337,6 +337,7 @@ def _visited(folder: Path) -> None:
     np.savez_compressed(folder / "visited.npz", seen=1, count=1, **stored)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
 def test_whatever_is_damaged_is_read_right_or_refused_in_one_line(target: Target, tmp_path: Path) -> None:
     target.make(tmp_path)

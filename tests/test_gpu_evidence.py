@@ -43,6 +43,7 @@ def test_a_checked_in_gpu_result_is_of_this_code() -> None:
     assert waiting is None or not tested, "nothing is pending: remove that file"
 
 
+@pytest.mark.slow
 def test_the_kernels_compile_to_the_machine_code_that_was_tested(cubins: Path) -> None:
     here = machine_code.machine_code(cubins)
     if here is None:

@@ -60,6 +60,7 @@ def test_every_number_format_is_run_small_and_at_full_size() -> None:
             assert {"golden", "full", "shallow"} <= names
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize("target", NUMBERS)
 def test_ptx_is_for_its_target_and_kept_apart_from_machine_code(tmp_path: Path, target: str) -> None:
@@ -119,6 +120,7 @@ print(len(Driver.loaded))
 """
 
 
+@pytest.mark.slow
 def test_triton_compiles_ptx_for_the_older_gpu_and_then_for_its_own_again() -> None:
     pytest.importorskip("triton", reason="Triton isn't installed")
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}

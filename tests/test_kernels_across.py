@@ -40,6 +40,7 @@ def exact(mode: Mode, x: Tensor, weights: Tensor, product: Tensor) -> Tensor:
     return x @ weights
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
 @pytest.mark.parametrize("seed", [0, 5])
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from turbopi.kernels.sm90.attention.suffix_tile import FewTile, SuffixTile
 from turbopi.quantization.fp8 import E4M3
 from turbopi.support.errors import BackendUnavailable
 
-pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")]
 SEEDS = (0, 1, 5)  # of the order in which threads go; with 1 and 5 products read at once, with 5 a CTA stands still
 
 

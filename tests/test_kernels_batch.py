@@ -122,6 +122,7 @@ def check_packed(attend: Callable[..., Tensor], lengths: list[int], spare: int, 
         at += length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state_token", [False, True])
 @pytest.mark.parametrize("blocks", [1, 1000])
 @pytest.mark.parametrize("lengths", [[300, 0, 5], [64, 129]])
@@ -239,6 +240,7 @@ def test_embedding_rows() -> None:
     assert torch.equal(ours, twin) and torch.equal(ours[[0, 3, 4]], pictures[[2, 5, 0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [None, 0, 3])
 @pytest.mark.parametrize(("gated", "shifted"), [(True, True), (False, True), (False, False)])
 @pytest.mark.parametrize("width", [64, 96])

@@ -201,6 +201,7 @@ def test_a_machine_without_gpu_is_refused() -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(
     ("name", "suffix", "fp8"),
@@ -225,6 +226,7 @@ def machine_code(name: str, folder: Path, cubins: Path, *, suffix: int, fp8: boo
     return disassembled(denoise.compiled("sm_90a", sizes, folder=cubins), folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_path: Path, cubins: Path) -> None:
     # ptxas leaves out products whose sums nobody reads
@@ -232,6 +234,7 @@ def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_pa
     assert re.search(r"HMMA[^\n]*\n[^\n]*NANOSLEEP 0x64", code), "100 ns without a product before them"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(
     ("suffix", "fp8", "together"),  # rounds are of two products where slots are small
@@ -247,6 +250,7 @@ def test_products_do_not_wait_for_each_other(
     assert products >= 3 * len(re.findall(r"WARPGROUP\.DEPBAR\.LE gsb0, 0x0", code)) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (10, True), (24, False), (50, True)])
 def test_ptxas_knows_that_the_lanes_of_a_warp_stay_together(

@@ -89,6 +89,7 @@ def local_memory(code: str) -> int:
     return len(re.findall(r"\b(?:STL|LDL)\b", loop[: loop.index(".section")] if ".section" in loop else loop))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(("suffix", "fp8"), [(10, True), (24, False), (50, False), (50, True)])
 def test_it_compiles_without_more_memory_traffic_or_waits_than_with_one_time(
@@ -274,6 +275,7 @@ def test_a_number_is_guided_and_moved_as_pytorch_would(on_cpu: OnCpu) -> None:
         assert (changed.value, following) == (float(v), float(x + t.steps[step, token] * v))
 
 
+@pytest.mark.slow
 def test_what_a_cta_takes_of_the_tables_is_prefetched(on_cpu: OnCpu) -> None:
     g, suffix = on_cpu.p.config.expert, len(on_cpu.p.noise)
     table, shifted = on_cpu.kept["table"], on_cpu.kept["shifted"]

@@ -74,11 +74,16 @@ def run(
     return sums
 
 
+# Both forms; the full model's widths; tiles and ranks that divide nothing; several groups.
+SIZES = (("odd", 10), ("uneven", 50), ("wide", 3), ("wide", 20), ("shallow", 10), ("shallow", 50))
+FAST = (("odd", 10, "bf16"), ("uneven", 50, "bf16"), ("wide", 3, "bf16"), ("odd", 10, "fp8"))
+MORE = [(*size, precision) for size in SIZES for precision in ("bf16", "fp8") if (*size, precision) not in FAST]
+
+
 @pytest.mark.parametrize(
-    ("name", "suffix"),  # both forms; the full model's widths; tiles and ranks that divide nothing; several groups
-    [("odd", 10), ("uneven", 50), ("wide", 3), ("wide", 20), ("shallow", 10), ("shallow", 50)],
+    ("name", "suffix", "precision"),
+    [*FAST, *(pytest.param(*one, marks=pytest.mark.slow) for one in MORE)],
 )
-@pytest.mark.parametrize("precision", ["bf16", "fp8"])
 def test_the_kernels_products_of_packed_weights_are_those_of_the_matrices(
     in_part: None, folder: Path, name: str, suffix: int, precision: Precision
 ) -> None:

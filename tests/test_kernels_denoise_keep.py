@@ -55,6 +55,7 @@ def rows_of_tiles(a: Arrangement, queries: int, keys_values: int, gates: int) ->
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
 @pytest.mark.parametrize(
     ("name", "suffix"), [("golden", 10), ("golden", 50), ("odd", 16), ("odd", 33), ("uneven", 7), ("wide", 20)]

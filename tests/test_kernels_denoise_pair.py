@@ -45,6 +45,7 @@ SHAPES = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(("suffix", "fp8"), [(20, False), (32, True)])
 def test_the_source_compiles_for_hopper(tmp_path: Path, suffix: int, fp8: bool) -> None:

@@ -175,6 +175,7 @@ def test_a_tensor_map_that_cannot_be_made_names_its_sizes(driver: Any) -> None:
         instructions.tensor_map(0xABC0, (64, 3), (64,), (64, 1))
 
 
+@pytest.mark.slow
 def test_failed_launches_are_heeded_without_asserts_too() -> None:
     script = (
         "from turbopi.kernels.nvrtc import checked\n"
@@ -220,6 +221,7 @@ def test_modules_of_two_devices_are_two(driver: Any, monkeypatch: pytest.MonkeyP
     nvrtc._UNUSED.clear()
 
 
+@pytest.mark.slow
 def test_a_kernel_without_its_function_leaves_no_module(driver: Any) -> None:
     installed = driver(cuModuleGetFunction=(Status.CUDA_ERROR_NO_BINARY_FOR_GPU, None))
     with pytest.raises(BackendError, match="cuModuleGetFunction"):

@@ -47,6 +47,7 @@ def check(rows: int, width: int, with_y: bool, inverse: float | None, device: st
     assert error < (2e-3 if inverse is None else 1e-2), "they differ where a sum is close to the middle of two numbers"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1152, 256, 40])
 @pytest.mark.parametrize("with_y", [False, True])
 @pytest.mark.parametrize("inverse", [None, INVERSE])

@@ -62,6 +62,7 @@ def poison_allocator() -> None:
             torch.full((size,), torch.nan, device=DEVICE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [32, 96, 1024, 1152, 2048])
 @pytest.mark.parametrize("rows", [1, 10, 51, 563])
 @pytest.mark.parametrize("form", ["first", "residual", "modulated", "by token", "split", "rounded parts"])

@@ -110,6 +110,7 @@ def test_older_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None
     assert "in FP8 needs compute capability 8.9 or newer, this GPU has 8.6" in str(denoise.unavailable(GPU, "fp8"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize("arch", ["sm_80", "sm_86", "sm_89", "sm_120"])
 def test_the_source_compiles_for_gpus_that_are_not_here(tmp_path: Path, arch: str) -> None:

@@ -30,7 +30,7 @@ from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.models.pi0.denoise import euler_step
 from turbopi.quantization.formats import INT8
 
-pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")]
 CPU = torch.device("cpu")
 TAKES = Parameters((Parameter("Args", "args"), Parameter("int", "prepare")))
 BOTH = """

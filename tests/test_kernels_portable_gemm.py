@@ -77,6 +77,7 @@ def every_tile(epilogue: Epilogue, k: int) -> list[Tile]:
     return fitting if ON_GPU else [tile for tile in fitting if replace(tile, splits=1) in SMALL]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
 @pytest.mark.parametrize("epilogue", EPILOGUES)
 @pytest.mark.parametrize("out_rounded", [False, True])

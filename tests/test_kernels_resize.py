@@ -39,6 +39,7 @@ def check(found: np.ndarray, image: np.ndarray, way: ImageResize) -> None:
         np.testing.assert_array_equal(found, fitted(image, side, way))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("size", SIZES if ON_GPU else ((37, 53), (28, 80), (100, 61)))
 def test_pictures_are_resized_as_on_a_cpu(size: tuple[int, int], way: ImageResize) -> None:
@@ -46,6 +47,7 @@ def test_pictures_are_resized_as_on_a_cpu(size: tuple[int, int], way: ImageResiz
     check(resized([image], way)[0], image, way)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["openpi", "lerobot"])
 def test_cameras_of_different_sizes_and_layouts_come_each_to_its_place(way: ImageResize) -> None:
     turned = picture(40, 60).transpose(1, 0, 2)  # not in one piece

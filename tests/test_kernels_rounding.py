@@ -83,6 +83,7 @@ def exact_sums(rows: int, columns: int, num: int) -> tuple[Tensor, ...]:
     )
 
 
+@pytest.mark.slow
 @EVERY_FORMAT
 @pytest.mark.parametrize(("rows", "columns", "num"), [(40, 32, 4), (16, 24, 3), (5, 1, 1)])
 def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int, format: Format) -> None:
@@ -102,6 +103,7 @@ def in_e4m3(x: Tensor) -> tuple[Tensor, Tensor]:
     return ours.view(torch.uint8).flatten().cpu(), to_e4m3(x, 1.0).view(torch.uint8)
 
 
+@pytest.mark.slow
 def test_bfloat16_becomes_the_byte_that_pytorch_makes_of_it() -> None:
     """Positive ones from 2^-11, which becomes 0, to 2^9, which saturates."""
     first, last = (torch.tensor(x, dtype=torch.bfloat16).view(torch.int16).item() for x in (2**-11, 512.0))

@@ -95,6 +95,7 @@ def attention_and_back(ops: Any, given: tuple[Tensor, ...], turn: list[Tensor], 
     return whole(y), whole(ops.qkv_vjp(gradients, *turn, qkv))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("expert", "tokens"), SIZES)
 @pytest.mark.parametrize("state_token", [False, True])
 @pytest.mark.parametrize(("length", "slots"), [(37, 40), (560, 566), (200, 566)])
@@ -116,6 +117,7 @@ def test_attention_and_back(expert: GemmaConfig, tokens: int, state_token: bool,
         assert_as_good(found, expected, right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("expert", "tokens"), SIZES)
 @pytest.mark.parametrize("state_token", [False, True])
 def test_what_attention_keeps_of_all_layers_at_once(expert: GemmaConfig, tokens: int, state_token: bool) -> None:
@@ -135,6 +137,7 @@ def test_what_attention_keeps_of_all_layers_at_once(expert: GemmaConfig, tokens:
         assert_as_good(kept.attended, expected.attended, exact)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tokens", [3, 20])
 def test_attention_equals_autograd(tokens: int) -> None:
     """In float64, of everything between q|k|v and the product behind attention."""

@@ -21,6 +21,8 @@ from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, PromptTokenizer, load_tokenizer
 from turbopi.support.errors import TurboPiError
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()
 CONFIG, PRE, POST = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"

@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_turbopi_computes_what_lerobot_computed(tmp_path: Path, name: str) -> None:
     case = GoldenCase(GOLDEN / name)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from lerobot_golden import GOLDEN, GoldenCase
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()
 CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))

@@ -271,6 +271,7 @@ def _mutate(content: Any, rng: random.Random) -> Any:
     return content
 
 
+@pytest.mark.slow
 def test_any_pipelines_are_read_or_refused_in_one_line(folder: Path) -> None:
     """What is read has the steps that are done in the order that they are done, none of them twice."""
     relative_on(folder, action_names=JOINTS)
@@ -299,6 +300,7 @@ def test_any_pipelines_are_read_or_refused_in_one_line(folder: Path) -> None:
     assert all("\n" not in told and (PRE in told or POST in told) for told in refusals)
 
 
+@pytest.mark.slow
 def test_any_config_is_read_or_refused_in_one_line(folder: Path) -> None:
     relative_on(folder)
     files = {name: json.loads((folder / name).read_text()) for name in ("config.json", PRE, POST)}

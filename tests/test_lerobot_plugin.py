@@ -22,6 +22,8 @@ from turbopi import UnifiedPolicy, open_checkpoint
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.robots.raw_keys import ROBOT_TYPES
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()
 CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))

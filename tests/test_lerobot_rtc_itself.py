@@ -19,6 +19,8 @@ from torch import Tensor
 from turbopi.models.pi0.conditioning import GuidanceMode, guidance_strength, lerobot_guidance_weights
 from turbopi.models.pi0.denoise import Pull, guided_velocity
 
+pytestmark = pytest.mark.slow
+
 H, A = 10, 7
 MOST = 10.0
 RUNS = [  # schedule, delay, execution horizon, left-over's rows, t

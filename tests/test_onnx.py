@@ -35,6 +35,8 @@ from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigEr
 from turbopi.support.installation import install_command
 from turbopi.verify.check_golden import check_case
 
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("two_layers")]
+
 for library in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(library)
 

@@ -38,6 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_package(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
@@ -52,6 +53,7 @@ def test_the_wheel_holds_every_file_of_the_package(wheel: Path) -> None:
     assert packed == written
 
 
+@pytest.mark.slow
 def test_the_wheel_works_in_an_environment_of_its_own(wheel: Path, tmp_path: Path) -> None:
     """Turbo-Pi is imported from the wheel; its dependencies are those of this environment."""
     site = tmp_path / "site"
@@ -77,6 +79,7 @@ def test_the_wheel_works_in_an_environment_of_its_own(wheel: Path, tmp_path: Pat
     assert "Usage" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("before", "given", "seen"),
     [("", None, "PASSIVE"), ("", "ACTIVE", "ACTIVE"), ("import torch; ", None, "None")],

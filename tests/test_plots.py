@@ -29,6 +29,7 @@ def quiet(dims: int) -> np.ndarray:
     return np.linspace(0.1, 0.9, dims) + 0.01 * RANDOM.standard_normal((10, dims))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "dims"), [("libero", 7), ("droid", 8), ("aloha", 14), ("mine", 9)])
 def test_noise_looks_small_and_every_row_has_the_same_axis(
     robot: str, dims: int, drawn: list[Figure], tmp_path: Path
@@ -92,6 +93,7 @@ def evaluated(drawn: list[Figure], folder: Path, **protocol: Any) -> dict[str, A
     return {name: figure.axes[0] for name, figure in zip(write_plots(results), drawn, strict=True)}
 
 
+@pytest.mark.slow
 def test_a_curve_of_episodes_that_were_all_solved_ends_at_100_percent(drawn: list[Figure], tmp_path: Path) -> None:
     """Also when one was solved by the very last step that was allowed: where the axis used to end."""
     free = evaluated(drawn, tmp_path / "free")["steps.png"]

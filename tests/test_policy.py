@@ -78,6 +78,7 @@ def policy() -> UnifiedPolicy:
     return UnifiedPolicy(random_checkpoint("pi05_tiny"), num_denoising_steps=2, precision="f32", device="cpu")
 
 
+@pytest.mark.slow
 def test_a_seed_or_noise_makes_the_result_deterministic(policy: UnifiedPolicy) -> None:
     observation = policy.example_observation()
     by_seed = policy.infer(observation, seed=3)["actions"]
@@ -88,6 +89,7 @@ def test_a_seed_or_noise_makes_the_result_deterministic(policy: UnifiedPolicy) -
     assert not np.array_equal(policy.infer(observation)["actions"], policy.infer(observation)["actions"])
 
 
+@pytest.mark.slow
 def test_a_batch_equals_its_observations(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
     together = policy.infer_batch(observations, seed=[7, 8, 9])

@@ -19,6 +19,8 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.models.observation import Observation
 from turbopi.support.errors import ActionError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H, D = 10, 32
 STAGES = {"vision": 1.0, "prefix": 2.0, "denoise": 3.0}
 

@@ -59,6 +59,7 @@ def test_transposed_pictures_resize_as_contiguous_ones() -> None:
 SIZES = ((480, 640), (720, 1280), (1080, 1920), (640, 480), (211, 1999), (224, 400), (900, 224), (224, 224))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cores", [1, 2, 3, 16])
 @pytest.mark.parametrize("way", RESIZES)
 def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
@@ -76,6 +77,7 @@ def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
     images._threads.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_forked_child_has_threads_of_its_own() -> None:
     code = """
 import os, numpy as np

@@ -58,6 +58,7 @@ def test_many_steps_leave_room_for_few_loops() -> None:
     assert Loop(1000, 10) in list(recent)
 
 
+@pytest.mark.slow
 def test_forty_numbers_of_steps_leave_few_graphs_and_every_answer_is_right() -> None:
     backend = on_cpu(cls=Unrun)
     observation, noise = made_up("pi05", 2, 5)
@@ -226,6 +227,7 @@ def test_fuseds_kernels_go_with_their_loops_and_the_expert_goes_away_with_the_la
     assert len(backend._kernels) == MOST_LOOPS and backend.expert_on == "host"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", [TensorRTBackend, TensorRTPipelinedBackend])
 def test_graphs_around_engines_are_bounded(cls: type[TensorRTBackend], tmp_path: Path) -> None:
     case, backend = golden_cases()["b_third_masked"], golden_backend(cls, "pi05", tmp_path)

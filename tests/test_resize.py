@@ -145,6 +145,7 @@ def resize_by_table(table: torch.Tensor, images: torch.Tensor) -> None:
             out.copy_(torch.from_numpy(fitted(image, len(out), "openpi")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(480, 640), (224, 224)])
 def test_a_backend_that_resizes_launches_vision_in_the_form_that_its_pictures_need(
     reference: UnifiedPolicy, size: tuple[int, int]

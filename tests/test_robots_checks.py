@@ -18,6 +18,8 @@ from turbopi.preprocess.pipeline import Pipeline
 from turbopi.robots import Robot, RobotInputs
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 TINY = ("--random-weights", "pi05_tiny")
 ARM = {
     "name": "my_arm",
@@ -272,6 +274,7 @@ def test_convert_records_a_built_in_robot_and_no_class(tmp_path: Path) -> None:
     assert not (tmp_path / "class").exists()
 
 
+@pytest.mark.slow
 def test_calibrate_reads_the_robots_keys(arm_json: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for number in range(3):

@@ -25,6 +25,8 @@ from turbopi.policy.chunk_conditioning import Joining
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H, A = 10, 32
 TRAINED = RealTime(trained_max_delay=3)
 
@@ -357,6 +359,7 @@ CHUNKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["policy", "engine"])
 def test_a_batch_joins_a_chunk_in_each_row_as_infer_does(which: str, request: pytest.FixtureRequest) -> None:
     policy: UnifiedPolicy = request.getfixturevalue(which)
@@ -377,6 +380,7 @@ def test_a_batch_joins_a_chunk_in_each_row_as_infer_does(which: str, request: py
         assert any(one.startswith("4 observations") and "by token" in one for one in batches), "all but the one guided"
 
 
+@pytest.mark.slow
 def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy) -> None:
     """Times of its own bring the number of steps, for all rows."""
     seen = [engine.example_observation(seed) for seed in range(3)]
@@ -392,6 +396,7 @@ def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy
         np.testing.assert_allclose(one["actions"], expected["actions"], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_relative_actions_of_a_batch_are_moved_to_each_rows_own_state(engine: UnifiedPolicy) -> None:
     moved: list[np.ndarray] = []
     pipeline = engine.pipeline

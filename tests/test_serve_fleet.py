@@ -306,6 +306,7 @@ def test_autoscaling_is_rays_own_as_json() -> None:
             read_autoscaling(text)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Ray's own
 def test_what_autoscaling_has_and_ray_has_not_is_refused() -> None:
     pytest.importorskip("ray")

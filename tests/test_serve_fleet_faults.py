@@ -33,9 +33,10 @@ from turbopi.policy.shipped import load_frames
 from turbopi.realtime.wire import pack, unpack
 from turbopi.serve.fleet.session_affinity import SOON_SECONDS
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None, reason="needs Ray Serve: pip install -e '.[ray]'"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray Serve: pip install -e '.[ray]'"),
+]
 
 MOST_SECONDS = 120.0
 TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}  # else Ray writes one into the home folder

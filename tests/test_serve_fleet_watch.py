@@ -132,6 +132,7 @@ class Response:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Ray's own
 def test_requests_that_wait_are_answered_when_ray_ends_and_health_says_so(ray: socket.socket) -> None:
     pytest.importorskip("ray")

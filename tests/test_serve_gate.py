@@ -213,6 +213,7 @@ def test_another_version_of_http_is_refused(version: str) -> None:
     served(test)
 
 
+@pytest.mark.slow
 def test_whatever_knocks_is_answered_as_the_attack_on_the_doors_expects() -> None:
     """With each version of the websockets library: some of it is that library's doing."""
 
@@ -393,6 +394,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_a_server_whose_device_is_lost_says_503_and_then_exits_with_4() -> None:
     async def lose(url: str) -> None:
         async with connect(url) as client:

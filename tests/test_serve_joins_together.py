@@ -24,6 +24,8 @@ from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.serve.scheduling.schedule import Request, Schedule
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 GUIDED: dict[str, Any] = {"execution": "rtc", "control_hz": 50.0}
 
 
@@ -312,6 +314,7 @@ def test_sessions_are_not_waited_for_where_joining_together_does_not_pay() -> No
 # --- a real policy ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("pays")
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_a_real_policys_joined_chunks_are_those_of_their_session_in_any_company(mode: str) -> None:

@@ -145,6 +145,7 @@ def test_stopping_waits_for_no_client_that_does_not_read() -> None:
     asyncio.run(main())
 
 
+@pytest.mark.slow
 def test_a_client_that_pings_and_never_reads_is_closed() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         async with raw(server) as bad:
@@ -165,6 +166,7 @@ def test_a_client_that_pings_and_never_reads_is_closed() -> None:
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_of_large_messages_stays_when_their_clients_have_left() -> None:
     size = 30 * 2**20
     message = pack({"x": bytes(size)})

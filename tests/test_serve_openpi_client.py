@@ -18,6 +18,8 @@ from test_serve_real_time import Joins
 
 from turbopi.serve import running
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(
     os.environ.get("TURBOPI_OPENPI_CLIENT_PYTHON", REPOSITORY / ".venv-openpi-client" / "bin" / "python")

@@ -16,7 +16,7 @@ from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer, running
 from turbopi.support.errors import ObservationError
 
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: apt-get install chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: apt-get install chromium")]
 
 HOSTILE = "</script><img src=x onerror=\"document.title='owned'\"><b>bowl</b>"
 ACTIONS = np.stack([np.linspace(-1, 1, 5), *(np.full(5, value) for value in (0, 0.5, 0, 0, 0, -1))], axis=1)

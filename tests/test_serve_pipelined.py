@@ -135,6 +135,7 @@ def test_an_answer_that_never_comes_holds_no_stop(monkeypatch: pytest.MonkeyPatc
     asyncio.run(main())
 
 
+@pytest.mark.slow
 def test_a_pipelined_backends_served_actions_are_its_own(tmp_path: Path) -> None:
     """The real backend on its engines' twins, under three robots at once."""
     policy: Any = policy_on(

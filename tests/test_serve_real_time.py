@@ -34,6 +34,8 @@ from turbopi.serve.options import JOINING
 from turbopi.serve.real_time import RealTime
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H, A = 10, 3
 REAL_TIME = {"modes": ["rtc", "rtc_identity", "rtc_trained"], "trained_max_delay": 2, "execution_horizon": None}
 
@@ -627,6 +629,7 @@ def drive(executor: RealTimeExecutor, observation: dict[str, Any], chunks: int) 
     return kinds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("execution", ["sync", "rtc", "rtc_identity"])
 @pytest.mark.parametrize("remote", [False, True])
 def test_the_executor_runs_a_real_policy_here_and_on_a_server(

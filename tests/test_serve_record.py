@@ -77,6 +77,7 @@ def test_text_that_could_not_be_read_again_is_not_recorded(tmp_path: Path) -> No
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @given(TREES)
 @settings(deadline=None, max_examples=100)
 def test_any_observation_comes_back_unchanged(

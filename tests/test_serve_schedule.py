@@ -160,6 +160,7 @@ def test_every_request_has_one_turn_or_one_refusal(made: list[Request], seconds:
         assert refused.kind != "replaced" or one.session is not None
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(arrivals(), tables, limits)
 def test_a_turn_is_a_batch_only_where_the_table_says_it_is_sooner(
@@ -175,6 +176,7 @@ def test_a_turn_is_a_batch_only_where_the_table_says_it_is_sooner(
             assert together is not None and together < turn.rows * T1
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(arrivals(), tables, limits)
 def test_who_runs_meets_the_deadline_that_it_gave(made: list[Request], seconds: dict[int, float], limit: int) -> None:
@@ -481,6 +483,7 @@ def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, l
     return min(got / ask for got, ask in zip(good, asked, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("others", "pause"),
     [(17, 0.001), (24, 0.001), (40, 0.001), (150, 0.01), (17, 0.1), (40, 0.05), (40, 0.1), (150, 0.05), (150, 0.1)],
@@ -490,6 +493,7 @@ def test_a_robot_is_served_beside_a_crowd_that_asks_again_at_once(others: int, p
     assert beside(Crowd(others, pause), [own]) >= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "crowd",
     [
@@ -515,6 +519,7 @@ def test_no_crowd_takes_a_robots_turn(crowd: Crowd) -> None:
     assert beside(crowd, [0.2]) >= 0.95
 
 
+@pytest.mark.slow
 def test_several_robots_are_served_beside_a_crowd() -> None:
     assert beside(Crowd(40, 0.01), [0.2, None, 0.2, 0.1, 0.2]) >= 0.95
     assert beside(Crowd(40, 0.01, within=0.2, firm=True), [0.2] * 5) >= 0.95

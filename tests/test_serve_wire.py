@@ -142,6 +142,7 @@ def large_from(size: int) -> Iterator[None]:
 KEYS_END = len(b"__npgeneric__") + 1  # no key of the format is set aside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("large", [wire.LARGE, KEYS_END])
 @given(value=VALUES.filter(lambda value: "__ndarray__" not in str(value) and "__npgeneric__" not in str(value)))
 @settings(deadline=None, max_examples=200)
@@ -505,6 +506,7 @@ def test_a_damaged_request_never_crashes_the_decoder(changes: list[tuple[int, in
     decodes_or_refuses(bytes(damaged[:cut]))
 
 
+@pytest.mark.slow
 @given(ODD_VALUES | ARRAY_LIKE | SCALAR_LIKE)
 @settings(deadline=None, max_examples=500)
 def test_odd_structures_never_crash_the_decoder(value: Any) -> None:

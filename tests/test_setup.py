@@ -1,5 +1,6 @@
 """scripts/setup: which PyTorch a machine gets, and what it is told. Python, pip and the GPU are made up."""
 
+import ast
 import json
 import os
 import re
@@ -195,3 +196,59 @@ def test_the_extra_cuda_is_what_the_gpu_tests_ran_with() -> None:
     ran = json.loads(gpu_evidence.result_files()[-1].read_text(encoding="utf-8"))["provenance"]
     pinned = pins()
     assert pinned["torch"] == ran["torch"].split("+")[0] and pinned["triton"] == ran["triton"]
+
+
+# --- what the fast tests need -----------------------------------------------------------------------------------------
+
+LEFT_OUT = {"lerobot", "libero", "modelopt", "mujoco", "openpi_client", "ray", "rerun", "robosuite", "tensorrt_rtx"}
+FILES = [*(ROOT / "tests").glob("test_*.py"), *(ROOT / "packages/turbopi-lab/tests").glob("test_*.py")]
+
+
+def needed(*code: ast.AST) -> set[str]:
+    """Packages of other extras that code imports, or that it skips without."""
+    found: set[str] = set()
+    for node in (node for one in code for node in ast.walk(one)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add((node.module or "").partition(".")[0])
+        elif isinstance(node, ast.Call) and re.search(r"\b(importorskip|find_spec)$", ast.unparse(node.func)):
+            found |= {argument.value for argument in node.args if isinstance(argument, ast.Constant)}
+    return found & LEFT_OUT
+
+
+def fast_tests_that_need_more(text: str) -> dict[str, set[str]]:
+    """{"" for the file itself, or a test: packages}."""
+    body = ast.parse(text).body
+    given = {ast.unparse(one.targets[0]): one.value for one in body if isinstance(one, ast.Assign)}
+    if "mark.slow" in ast.unparse(given.get("pytestmark", ast.Constant(None))):
+        return {}
+    functions = [node for node in ast.walk(ast.Module(body, [])) if isinstance(node, ast.FunctionDef)]
+    tests = [one for one in functions if "pytest.mark.slow" not in map(ast.unparse, one.decorator_list)]
+    found = {
+        one.name: needed(one, *(given[name] for name in map(ast.unparse, one.decorator_list) if name in given))
+        for one in tests
+        if one.name.startswith("test_")
+    }
+    found[""] = needed(*(one for one in body if isinstance(one, ast.Import | ast.ImportFrom | ast.Expr)))
+    return {name: packages for name, packages in found.items() if packages}
+
+
+def test_no_fast_test_needs_a_package_that_setup_dev_leaves_out() -> None:
+    found = {file.name: fast_tests_that_need_more(file.read_text(encoding="utf-8")) for file in FILES}
+    assert not {file: tests for file, tests in found.items() if tests}
+
+
+def test_what_a_test_needs_is_seen_in_its_code_its_marks_and_its_file() -> None:
+    text = """
+import {package}
+with_it = pytest.mark.skipif(find_spec("rerun") is None)
+@with_it
+def test_marked(): pass
+def test_importing(): from libero.libero import envs
+{mark}
+def test_slow(): pytest.importorskip("ray")
+"""
+    found = fast_tests_that_need_more(text.format(package="ray.serve", mark="@pytest.mark.slow"))
+    assert found == {"": {"ray"}, "test_marked": {"rerun"}, "test_importing": {"libero"}}
+    assert "test_slow" in fast_tests_that_need_more(text.format(package="os", mark="# fast"))

@@ -24,7 +24,7 @@ try:
 except SimulatorUnavailable as error:
     pytest.skip(str(error), allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("default")  # the simulator's libraries warn as they like
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]  # the simulator's libraries warn as they like
 SUITE, TASK = "libero_spatial", 0
 PX = 128
 
@@ -184,8 +184,12 @@ def test_the_command_runs_two_tasks_with_random_weights(tmp_path: Path) -> None:
 def test_the_small_policy_solves_tasks_it_was_trained_for(tmp_path: Path) -> None:
     """Seeded. It solves 40 of 40 on a GPU machine's renders; should physics or renders differ, one of two suffices."""
     simulator, protocol, videos = create("libero"), Protocol("libero", SUITE), VideoPlan("none")
-    jobs = make_jobs(choose_tasks(simulator, SUITE, [0, 2]), [30], None, videos)
     source = LocalPolicy(UnifiedPolicy(SMALL_POLICY, backend="pytorch", precision="f32", device="cpu"))
-    results = prepare(tmp_path, protocol, source, simulator, jobs, restart=False)
-    evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
-    assert sum(episode.success for episode in results.in_order()) >= 1
+
+    def solves(task: int) -> bool:
+        jobs = make_jobs(choose_tasks(simulator, SUITE, [task]), [30], None, videos)
+        results = prepare(tmp_path / str(task), protocol, source, simulator, jobs, restart=False)
+        evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
+        return all(episode.success for episode in results.in_order())
+
+    assert solves(0) or solves(2)

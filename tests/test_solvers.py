@@ -210,6 +210,7 @@ def engine(request: Any) -> OnCpu:
     return on_cpu(request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_the_engines_operations_equal_the_reference(engine: OnCpu, solver: Solver) -> None:
     observation, noise = made_up(engine.config.kind, 2, 19)
@@ -225,6 +226,7 @@ def test_the_engines_operations_equal_the_reference(engine: OnCpu, solver: Solve
     assert torch.equal(engine.sample(observation, noise, 3).actions, plain), "plain calls keep their bits"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_token", [True, False])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_fuseds_kernels_evaluate_a_solvers_loop(

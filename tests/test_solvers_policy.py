@@ -22,6 +22,8 @@ from turbopi.models.pi0.solvers import SOLVERS, Integration
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 UNEVEN = (1.0, 0.7, 0.2, 0.0)
 
 
@@ -59,6 +61,7 @@ def test_a_policys_solver_is_a_calls_and_the_backends(tiny: Any, policy: Unified
     assert policy.loop_arguments == {}
 
 
+@pytest.mark.slow
 def test_eulers_uniform_steps_by_name_and_one_evaluation_of_any_solver_are_openpis_to_the_last_bit(
     policy: UnifiedPolicy,
 ) -> None:
@@ -73,6 +76,7 @@ def test_eulers_uniform_steps_by_name_and_one_evaluation_of_any_solver_are_openp
     np.testing.assert_array_equal(heun["actions"], plain[2])
 
 
+@pytest.mark.slow
 def test_times_bring_their_number_of_steps(tiny: Any, policy: UnifiedPolicy) -> None:
     observation = policy.example_observation()
     own = made(tiny, solver="midpoint", time_grid=UNEVEN)
@@ -129,6 +133,7 @@ def test_the_other_backends_have_no_solvers() -> None:
         assert "solver" not in getattr(backend, "forms", ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity"])
 def test_chunks_join_by_eulers_steps_on_any_grid_and_other_solvers_refuse(
     tiny: Any, policy: UnifiedPolicy, mode: Any
@@ -214,6 +219,7 @@ def test_infer_takes_a_solver_and_times(tmp_path: Path, policy: UnifiedPolicy) -
     assert "--time-grid" in told and "isn't times with commas between them" in told
 
 
+@pytest.mark.slow
 def test_verify_judges_a_solver_against_the_reference_with_the_same_one(tmp_path: Path) -> None:
     options = ("--random-weights", "pi05_tiny", "--backend", "pytorch", "--device", "cpu", "--count", "1")
     result = turbopi("verify", *options, "--noises", "1", "--steps", "3", "--solver", "exponential", "--json")
@@ -221,6 +227,7 @@ def test_verify_judges_a_solver_against_the_reference_with_the_same_one(tmp_path
     assert json.loads(result.stdout)["policy"]["solver"] == "exponential" and "3 steps of exponential" in result.output
 
 
+@pytest.mark.slow
 def test_bench_measures_a_solver_and_says_so(tmp_path: Path) -> None:
     options = ("bench", "--random-weights", "pi05_tiny", "--backends", "pytorch", "--device", "cpu", "--calls", "2")
     more = ("--no-error", "--report", tmp_path, "--time-grid", "1,0.5,0")

@@ -14,6 +14,8 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.models.observation import Observation
 from turbopi.support.errors import ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 
 @pytest.fixture(scope="module")
 def policy() -> UnifiedPolicy:
@@ -46,6 +48,7 @@ def submitting(policy: UnifiedPolicy) -> tuple[UnifiedPolicy, Submitting]:
     return policy_on(lambda *_, **__: backend, random_checkpoint("pi05_tiny"), num_denoising_steps=2), backend
 
 
+@pytest.mark.slow
 def test_submitted_calls_give_what_infer_gives(policy: UnifiedPolicy) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
     expected = [policy.infer(obs, seed=seed)["actions"] for seed, obs in enumerate(observations)]

@@ -29,6 +29,7 @@ def first(observation: Observation) -> Observation:
     return Observation(*(getattr(observation, name)[:1] for name in observation.__dataclass_fields__))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", BOTH)
 @pytest.mark.parametrize("case", CASES)
 def test_float32_twins_are_openpi_within_rounding(cls: type[TensorRTBackend], case: str, tmp_path: Path) -> None:
@@ -38,6 +39,7 @@ def test_float32_twins_are_openpi_within_rounding(cls: type[TensorRTBackend], ca
     assert [c for c in comparisons if not c.ok] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_half_precision_twins_are_within_openpis_own_error(case: str, tmp_path: Path) -> None:
     one = golden_cases()[case]

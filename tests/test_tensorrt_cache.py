@@ -156,6 +156,7 @@ def store(folder: Path, number: int, times: int) -> None:
         cache.get_or_build(specification(), Builder(bytes([number]) * 50_000), rebuild=True)
 
 
+@pytest.mark.slow
 def test_an_engine_that_many_store_at_once_is_always_whole(cache: EngineCache) -> None:
     """Two processes and four threads store it, and it is read all the while: no store and no read fails."""
     store(cache.root, 255, 1)
@@ -236,12 +237,14 @@ def test_a_library_that_cant_be_loaded_isnt_replaced_by_the_other(
 # -- the builder -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_rtx
 def test_an_engine_is_built_without_a_gpu() -> None:
     plan = build(tensorrt.library(), specification(), compute_capability="SM89")
     assert len(plan) > 1000
 
 
+@pytest.mark.slow
 @needs_rtx
 @pytest.mark.parametrize("fp8", [False, True])
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
@@ -269,6 +272,7 @@ def test_every_engine_of_a_model_is_built_without_a_gpu(kind: Kind, fp8: bool, t
     assert engines.cached_shapes(2, 10) == [shape] and engines.cached_shapes(3, 10) == []
 
 
+@pytest.mark.slow
 @needs_rtx
 def test_a_network_that_cant_be_built_says_why() -> None:
     def write(ops: NetworkOps, inputs: dict[str, Value]) -> dict[str, Value]:
@@ -301,6 +305,7 @@ def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) 
     assert about["bytes"] == 4 and len(about["sha256"]) == 64
 
 
+@pytest.mark.slow
 @needs_rtx
 def test_an_engine_that_doesnt_fit_its_workspace_is_refused(
     cache: EngineCache, monkeypatch: pytest.MonkeyPatch

@@ -57,6 +57,7 @@ def test_hooks_leave_the_model_as_it_was() -> None:
     assert all(not part._forward_pre_hooks for part in model.modules())
 
 
+@pytest.mark.slow
 @needs_modelopt
 def test_modelopt_measures_the_same() -> None:
     ours, theirs = (

@@ -345,6 +345,7 @@ class Mixed(DigestPolicy):
         return super().infer(now)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "wrong"), [(DigestPolicy(0), False), (Mixed(), True)])
 def test_answers_that_belong_to_others_are_found(policy: DigestPolicy, wrong: bool) -> None:
     found = Found()
@@ -357,6 +358,7 @@ def test_answers_that_belong_to_others_are_found(policy: DigestPolicy, wrong: bo
         assert found.violations[0]["reproduce"].startswith("python -m attack frame 3 ")
 
 
+@pytest.mark.slow
 def test_damaged_files_through_their_readers(tmp_path: Path) -> None:
     """The judging is the tool's own business here: that each damage was read, and its outcome is known."""
     found, quick = Found(), [one for one in SPECIMENS if one.name in ("observation, by hand", "noise")]
@@ -372,6 +374,7 @@ def test_an_observation_of_no_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert ended.value.exit_code == 2 and "observation/image" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_tiny_run_leaves_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.json"
     assert main(["run", "frames", "--count", "80", "--seed", "5", "--out", str(file)]) == 0
@@ -385,6 +388,7 @@ def test_a_tiny_run_leaves_its_result(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["show", str(file)]) == 0
 
 
+@pytest.mark.slow
 def test_pieces_run_side_by_side_and_what_there_is_no_time_for_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,6 +36,7 @@ def compiled(tmp_path: Path, *arguments: str) -> CompiledForAll:
     return read_compiled(file)
 
 
+@pytest.mark.slow
 def test_the_chosen_products_compile_and_fit(tmp_path: Path) -> None:
     result = compiled(tmp_path, "--targets", "89", "--kernels", "gemm", "--chosen")
     assert len(result.rows) > 5 and result.versions["triton"]
@@ -43,6 +44,7 @@ def test_the_chosen_products_compile_and_fit(tmp_path: Path) -> None:
     assert all(row.registers and not row.spilled for row in result.rows)
 
 
+@pytest.mark.slow
 def test_fp8_is_refused_below_8_9_with_the_reason(tmp_path: Path) -> None:
     result = compiled(tmp_path, "--targets", "80", "--kernels", "gemm", "--chosen")
     refused = [row for row in result.rows if row.refused]
@@ -52,6 +54,7 @@ def test_fp8_is_refused_below_8_9_with_the_reason(tmp_path: Path) -> None:
     assert len(fit) == len(result.rows) - 1 > 5, "INT8's, in their place"
 
 
+@pytest.mark.slow
 def test_every_triton_kernel_is_among_the_calls() -> None:
     done = ours(
         "-c",
@@ -63,6 +66,7 @@ def test_every_triton_kernel_is_among_the_calls() -> None:
     assert json.loads(left) == [] and int(count) > 15, done.stderr
 
 
+@pytest.mark.slow
 def test_weights_are_rounded_to_every_format_on_every_gpu(tmp_path: Path) -> None:
     """Triton has no E4M3 below 8.9, and `turbopi calibrate` needs none of the hardware."""
     result = compiled(tmp_path, "--targets", "80", "--kernels", "rounding.feedback")
@@ -80,6 +84,7 @@ def test_the_checked_in_result_has_e4m3_only_where_triton_has_it() -> None:
     assert rounded == ALL
 
 
+@pytest.mark.slow
 def test_the_checked_in_result_has_every_cuda_kernel() -> None:
     done = ours(
         "-c",

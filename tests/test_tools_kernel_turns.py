@@ -127,6 +127,7 @@ def test_samples_lead_back_to_functions() -> None:
         waits(rows[:1], code, 512, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 def test_every_instruction_of_the_kernel_has_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("triton")

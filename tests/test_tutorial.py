@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from test_serve_openpi_client import PYTHON as CLIENT
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 

@@ -30,6 +30,8 @@ from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order,
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+
 STEPS = 2
 WEIGHTS = ("--random-weights", "pi05_tiny")
 QUICK = (*WEIGHTS, "--device", "cpu", "--steps", STEPS, "--count", 1, "--noises", 2)
@@ -55,6 +57,7 @@ def certified(backend: str, *more: object, exit_code: int = 0) -> dict[str, Any]
 # What is right
 
 
+@pytest.mark.slow
 def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path, drawn: list[Any]) -> None:
     document = certified("pytorch", "--report", tmp_path)
     read_again = read_document(tmp_path / "verify.json", Certificate)
@@ -111,6 +114,7 @@ def test_the_oracle_has_no_error_against_itself() -> None:
     assert document["weights"]["fingerprint"] is None
 
 
+@pytest.mark.slow
 def test_another_bf16_backend_is_held_to_plain_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
     plant(monkeypatch, "Correct")
     document = certified("faulty")
@@ -124,6 +128,7 @@ def test_another_bf16_backend_is_held_to_plain_bf16(monkeypatch: pytest.MonkeyPa
 # What is wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "precision", "first"),
     [
@@ -143,6 +148,7 @@ def test_the_first_wrong_intermediate_is_named(
     assert document["checks"][0]["ok"] is False
 
 
+@pytest.mark.slow
 def test_an_error_above_what_is_allowed_says_that_it_informs_and_another_number_decides(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -160,6 +166,7 @@ def test_an_error_above_what_is_allowed_says_that_it_informs_and_another_number_
     assert result.stdout.splitlines()[-1].startswith("PASS: ")
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_fails_with_a_whole_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     plant(monkeypatch, "NotFinite")
     document = certified("faulty", "--report", tmp_path, "--noises", 1, exit_code=1)
@@ -170,6 +177,7 @@ def test_what_is_not_finite_fails_with_a_whole_report(monkeypatch: pytest.Monkey
     assert (tmp_path / "steps.png").exists()
 
 
+@pytest.mark.slow
 def test_bits_that_change_on_repetition_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     plant(monkeypatch, "Unsteady")
     document = certified("faulty", exit_code=1)
@@ -179,11 +187,13 @@ def test_bits_that_change_on_repetition_fail(monkeypatch: pytest.MonkeyPatch) ->
     assert 0 < document["determinism"]["max"] < 1e-5
 
 
+@pytest.mark.slow
 def test_a_backend_that_hides_what_is_demanded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     plant(monkeypatch, "Secretive")
     assert "'faulty' doesn't expose v_t" in refusal_of("--backend", "faulty")
 
 
+@pytest.mark.slow
 def test_a_certificate_says_that_the_oracle_was_float32_whatever_the_program_had_set() -> None:
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
@@ -255,6 +265,7 @@ def test_a_control_that_gives_no_bound_passes_nothing() -> None:
     assert judged(NOISE, exact, exact, exact + np.inf, bound=1e-5).ok  # a bound of its own needs no control
 
 
+@pytest.mark.slow
 def test_weights_that_do_nothing_fail_as_nothing_to_judge(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(model: Pi0Model, *args: Any, **options: Any) -> torch.Tensor:
         for parameter in model.action_out_proj.parameters():
@@ -287,6 +298,7 @@ def test_a_golden_bf16_run_that_is_not_finite_is_no_bound(golden: Path) -> None:
 # Bounds, observations, refusals
 
 
+@pytest.mark.slow
 def test_overridden_bounds_decide_and_are_recorded() -> None:
     document = certified("pytorch", "--bound", "1e-9", "--noises", 1, exit_code=1)
     assert document["bounds"]["overridden"] is True
@@ -295,6 +307,7 @@ def test_overridden_bounds_decide_and_are_recorded() -> None:
     assert "is not within 1.00e-09 (the bound that was given)" in document["verdict"]
 
 
+@pytest.mark.slow
 def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
     policy = tiny_policy()
     for number in range(3):

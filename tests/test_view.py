@@ -262,6 +262,7 @@ def at(row: dict[str, Any]) -> float:
     return float(row["time"] / 1e9)
 
 
+@pytest.mark.slow
 @with_rerun
 def test_a_saved_recording_holds_what_was_recorded(
     recording: tuple[Path, dict[int, RecordedCall]], tmp_path: Path
@@ -313,6 +314,7 @@ def test_a_saved_recording_holds_what_was_recorded(
     assert names["SeriesLines:names"] == ["x", "y", "z"]
 
 
+@pytest.mark.slow
 @with_rerun
 def test_without_a_rate_no_action_is_said_to_be_executed(
     recording: tuple[Path, dict[int, RecordedCall]], tmp_path: Path
@@ -321,6 +323,7 @@ def test_without_a_rate_no_action_is_said_to_be_executed(
     assert not any(entity.startswith("/executed") for entity in read_back(tmp_path / "out.rrd"))
 
 
+@pytest.mark.slow
 @with_rerun
 def test_a_live_server_is_saved_below_each_robots_address(tmp_path: Path) -> None:
     file = tmp_path / "live.rrd"
@@ -337,6 +340,7 @@ def test_a_live_server_is_saved_below_each_robots_address(tmp_path: Path) -> Non
     assert len(found["/errors"]) == 1
 
 
+@pytest.mark.slow
 @with_rerun
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still being written
 def test_a_viewer_gets_the_whole_recording(

@@ -22,6 +22,8 @@ from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
 from turbopi.support.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
+
 H = 10
 
 
@@ -210,6 +212,7 @@ def test_a_compiler_that_is_switched_off_is_unavailable(variable: str, monkeypat
 # -- a horizon for one call --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [1, 6, 16])
 def test_a_call_may_have_a_horizon_of_its_own(horizon: int, reference: UnifiedPolicy) -> None:
     policy, obs = made(), seen_by(2, reference)

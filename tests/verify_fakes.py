@@ -12,7 +12,7 @@ from turbopi.models.observation import Observation
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Pi0Model, Trace
 
-FAULTY_LAYER = 2
+FAULTY_LAYER = 1
 FAULTY_STEP = 1
 
 

@@ -8,6 +8,7 @@ Comments, docstrings, blank lines and the texts of errors don't count.
 import ast
 import hashlib
 import re
+from functools import lru_cache
 from pathlib import Path
 
 from msgspec import UNSET, Struct, UnsetType
@@ -122,8 +123,12 @@ def fingerprint() -> dict[str, str]:
     """{file, relative to the repository: hash of its code} for the product's files and the GPU tests."""
     judging = [ROOT / "tools/kernel_turns" / name for name in ("problems.py", "portable.py", "ptx.py", "triton_ptx.py")]
     files = [*product_files(), *gpu_test_files(), *judging]
-    code = {str(path.relative_to(ROOT)): code_of(path, errors=False) for path in files}
-    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in code.items()}
+    return {str(path.relative_to(ROOT)): _hash_of(path, path.stat().st_mtime_ns) for path in files}
+
+
+@lru_cache(1024)
+def _hash_of(path: Path, changed: int) -> str:
+    return hashlib.sha256(code_of(path, errors=False).encode()).hexdigest()[:16]
 
 
 def imported_by(path: Path) -> set[str]:

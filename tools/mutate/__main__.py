@@ -52,7 +52,7 @@ def run_tests(tree: Path, tests: Iterable[str]) -> Ran:
         "PYTHONPATH": os.pathsep.join(filter(None, (folders, _others()))),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    options = ["-m", "not gpu", "-q", "-p", "no:cacheprovider", f"--junitxml={xml}"]
+    options = ["-m", "not gpu and not slow", "-q", "-p", "no:cacheprovider", f"--junitxml={xml}"]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *tests], cwd=tree, env=env, capture_output=True, text=True
     )

@@ -12,4 +12,6 @@ from shared import (  # noqa: F401
     gpu_or_interpreter,
     on_hopper,
     packed_arrays,
+    two_layers,
+    unseen_plots,
 )

@@ -21,6 +21,8 @@ from turbopi_lab.studies.fp8_and_fp4 import Research
 from turbopi_lab.studies.mask import CacheOff
 from turbopi_lab.studies.throughput import Throughput
 
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("two_layers")]
+
 RESULTS = Path(__file__).parents[3] / "benchmarks" / "results"
 
 

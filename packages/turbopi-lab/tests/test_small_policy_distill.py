@@ -17,6 +17,8 @@ from turbopi_lab.small_policy.distill import Settings, Student, Ways, teach
 from turbopi_lab.small_policy.forward import suffix_velocity
 from turbopi_lab.small_policy.start import trained_model
 
+pytestmark = pytest.mark.slow
+
 
 def settings(**changes: Any) -> Settings:
     return Settings(CHASE_POLICY, Path("nowhere"), **{"observations": 3, "noises": 2, "batch": 8} | changes)

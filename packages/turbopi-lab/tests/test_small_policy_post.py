@@ -1,10 +1,13 @@
 """The demonstrations of the two policies of the post: they differ in the side alone."""
 
 import numpy as np
+import pytest
 import torch
 
 from turbopi_lab.small_policy import post
 from turbopi_lab.studies.post import ONE_WAY, TWO_WAYS, Ways
+
+pytestmark = pytest.mark.slow
 
 
 def sides(ways: Ways, number: int = 300) -> np.ndarray:

@@ -38,6 +38,8 @@ from turbopi_lab.small_policy.scenes import INSTRUCTIONS, OTHER_PROMPT, TRAINING
 from turbopi_lab.small_policy.start import fresh_model
 from turbopi_lab.small_policy.train import Settings, Trainer, prompt_table, toy_memory
 
+pytestmark = pytest.mark.slow
+
 STATS = SMALL_POLICY / "assets" / "turbopi" / "libero_spatial" / "norm_stats.json"
 
 

@@ -43,6 +43,8 @@ from turbopi_lab.studies.rollouts import CHASE, Call, met, open_policy, play, sa
 from turbopi_lab.studies.spread import UNIFORM, bimodality
 from turbopi_lab.studies.study import Setup
 
+pytestmark = pytest.mark.usefixtures("unseen_plots")
+
 BROKEN = Control("Two and two is four.", False, "It is five.")
 
 
@@ -77,6 +79,7 @@ def test_every_study_loads_under_its_name_and_asks_a_question() -> None:
         assert study.name == name and study.question.endswith("?") and study.claimed
 
 
+@pytest.mark.slow
 def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_steps: Path) -> None:
     found = read_document(small_steps / report.JSON, Report)
     text = (small_steps / report.MARKDOWN).read_text()
@@ -97,6 +100,7 @@ def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_step
     assert all((small_steps / f"{plot.name}.png").is_file() for plot in found.plots)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kv_reuse", "fp8_and_fp4", "pipelining"])
 def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_path: Path) -> None:
     result = turbopi("study", name, "--small", "--device", "cpu", "--out", tmp_path)
@@ -105,6 +109,7 @@ def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_pat
     assert found.small and found.sound and len(found.controls) >= 2 and "small form" in report.markdown(found)
 
 
+@pytest.mark.slow
 def test_students_are_judged_beside_their_teacher(tmp_path: Path) -> None:
     given = ("study", "distillation", "--small", "--episodes", "4", "--device", "cpu", "--out", tmp_path)
     result = turbopi(*given, "--policy", f"chase.consistency={CHASE_POLICY}", "--policy", f"chase.mean={CHASE_POLICY}")
@@ -322,6 +327,7 @@ def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
 # --- reuse of keys and values -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_reused_is_the_plain_run_and_everything_reused_is_the_first_call() -> None:
     policy, episodes = open_policy("chase"), range(3)
     plain = play(policy, episodes, sampled(policy.model, kv_reuse.STEPS)).paths
@@ -334,6 +340,7 @@ def test_nothing_reused_is_the_plain_run_and_everything_reused_is_the_first_call
         assert always.error > 0.1
 
 
+@pytest.mark.slow
 def test_forms_of_reuse_agree_where_all_or_nothing_is_old() -> None:
     """With everything old, each form leaves the keys and values of the first call."""
     policy, episodes = open_policy("chase"), range(3)

@@ -28,6 +28,8 @@ from turbopi_lab.studies.rollouts import CHASE, open_policy, play
 from turbopi_lab.studies.simulated import PLAIN, Running, SimulatorCell, Variant, _check_pair, _initial_states, finished
 from turbopi_lab.studies.study import Setup
 
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unseen_plots")]
+
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
 
 

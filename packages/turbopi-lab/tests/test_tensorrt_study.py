@@ -23,6 +23,8 @@ from turbopi_lab.studies.precision import attention_study
 from turbopi_lab.studies.report import Report
 from turbopi_lab.studies.throughput import throughput_study
 
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("two_layers", "unseen_plots")]
+
 
 def one() -> tuple[Observation, torch.Tensor]:
     case = golden_cases()["b_third_masked"]
