@@ -41,7 +41,7 @@ _MODES: dict[str, NormMode] = {
     "MIN_MAX": "lerobot_min_max",
     "IDENTITY": "identity",
 }
-_SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
+SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 _VARIANTS = ("gemma_300m", "gemma_2b")
@@ -214,7 +214,7 @@ class LeRobotFolder:
         return RealTime(
             trained_max_delay=trained,
             execution_horizon=horizon - end if end < horizon else None,
-            schedule=_SCHEDULES[rtc.choice("prefix_attention_schedule", tuple(_SCHEDULES), default="LINEAR")],
+            schedule=SCHEDULES[rtc.choice("prefix_attention_schedule", tuple(SCHEDULES), default="LINEAR")],
             max_guidance_weight=rtc.number("max_guidance_weight", 0, 1e6, default=10.0),
         )
 

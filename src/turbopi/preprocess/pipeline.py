@@ -27,6 +27,7 @@ from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.base import all_finite, keys_of, listed, read_prompt, read_state
 from turbopi.robots.images import check_hwc, is_rgb8, to_uint8
+from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.plain import Plain
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
@@ -249,7 +250,7 @@ class Pipeline:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What a client may want to know of the robot, in plain values; `reset_pose` only if the robot has one."""
+        """What a client may want to know of the robot, in plain values; what only some robots have if this one does."""
         described: dict[str, object] = {
             "robot": self.robot.name,
             "robot_state_dim": self.robot.state_dim,
@@ -258,6 +259,8 @@ class Pipeline:
         }
         if self.robot.reset_pose is not None:
             described["reset_pose"] = list(self.robot.reset_pose)
+        if isinstance(self.robot, LeRobot):
+            described |= self.robot.features
         return described
 
     # Before the model
