@@ -98,10 +98,11 @@ class LeRobotFolder:
             robot="lerobot",
             normalization=self.normalization,
             robot_options=self._robot_options(),
-            discrete_state_input=self.kind == "pi05",
+            discrete_state_input=self.pipelines.state_in_prompt,
             image_resize="lerobot_0.4" if old else "lerobot",
             prompt_state_dim=self.pipelines.prompt_width or None if old else None,
             prompt_as_is=self.kind == "pi0",
+            prompt_labels=self.kind == "pi05" and not self.pipelines.state_in_prompt,
             num_denoising_steps=self.config.integer(
                 "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
             ),

@@ -318,6 +318,7 @@ class Pipeline:
             state,
             max_tokens=self.config.model.max_prompt_tokens,
             as_is=self.config.prompt_as_is,
+            labels=self.config.prompt_labels,
         )
 
     def _pad_state(self, sample: Incoming) -> None:
