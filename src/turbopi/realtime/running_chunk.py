@@ -20,7 +20,9 @@ class RunningChunk:
     """What is left of the running chunk when an observation is taken, as `UnifiedPolicy.infer` is told of it.
 
     left_over          float32[K, action_dim], 1 ≤ K ≤ H, in the model's normalised space, as `infer` returned it under
-                       "model_actions"; row 0 is the action that the robot carries out at the observation's time
+                       "model_actions"; row 0 is the action that the robot carries out at the observation's time.
+                       LeRobot's engine pads one that is shorter than e below: with zeros up to 0.6.1, with its last
+                       action since pull request 4454. For its numbers in "rtc_identity" pad it so
     delay              d, control steps: how many of these actions will be carried out before the new chunk arrives
     execution_horizon  s, control steps: how many actions of a chunk are carried out before the next takes over. Guided
                        modes pull towards the left-over before H − s; d ≤ H − s. None: the policy's, cut to H − d, or
