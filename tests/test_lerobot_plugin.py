@@ -221,13 +221,12 @@ def moved(done: subprocess.CompletedProcess[str]) -> int:
 
 
 @pytest.fixture(scope="module")
-def joining(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...]]:
+def joining(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...]]:
     """A checkpoint with relative actions, which LeRobot runs with RTC alone, and the modes that it can have there.
 
     0.6.1 has no mode "trained", and refuses a config.json that says how a checkpoint was trained for it.
     """
-    checkpoint = tmp_path_factory.mktemp("joining") / "checkpoint"
-    shutil.copytree(ran / "relative_excluded" / "checkpoint", checkpoint)
+    checkpoint = GoldenCase(GOLDEN / "relative_excluded").assemble(tmp_path_factory.mktemp("joining"))
     asked = in_lerobot(
         "-c", "from lerobot.policies.pi05 import PI05Config as C; print(hasattr(C, 'use_visual_memory'))"
     )

@@ -310,6 +310,16 @@ def test_a_delay_longer_than_was_trained_is_cut_with_a_warning(
     ]
 
 
+def test_calls_that_join_are_warm_before_the_robot_moves(modeling: Any, checkpoint: Path) -> None:
+    """LeRobot expects the longest delay that it has measured: one cold call would be expected for ever."""
+    policy, model = made(modeling, checkpoint)
+    warm: list[dict[str, Any]] = []
+    model.warmup, policy.config.warmup = lambda **of: warm.append(of), True
+    policy.init_rtc_processor()
+    set_rtc(policy, lerobot_fakes.rtc_config())
+    assert warm == [{"horizons": H, "real_time": "rtc_identity"}]
+
+
 def test_without_rtc_nothing_is_joined(modeling: Any, checkpoint: Path) -> None:
     policy, model = made(modeling, checkpoint)
     for rtc, left_over in ((None, torch.ones(5, 7)), (lerobot_fakes.rtc_config(), torch.ones(0, 7))):

@@ -95,7 +95,7 @@ class TurboPiPolicy(PreTrainedPolicy):
         if self.served is None and self.config.warmup:
             self._local.warmup(horizons=self.config.chunk_size, real_time=mode)
 
-    @torch.compiler.disable  # type: ignore[untyped-decorator]  # Turbo-Pi compiles for itself
+    @torch.compiler.disable  # Turbo-Pi compiles for itself
     @torch.no_grad()
     def predict_action_chunk(
         self,
