@@ -55,9 +55,15 @@ class PreTrainedPolicy(torch.nn.Module):
 def install(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Put the fakes, and the plugin's folder, where imports find them. Returns the plugin's modeling module."""
     contents: dict[str, dict[str, Any]] = {
+        "draccus": {},
+        "draccus.utils": {"DecodingError": type("DecodingError", (Exception,), {})},
         "lerobot": {},
         "lerobot.configs": {},
         "lerobot.configs.policies": {"PreTrainedConfig": PreTrainedConfig},
+        "lerobot.configs.types": {
+            "FeatureType": SimpleNamespace(VISUAL="VISUAL", STATE="STATE", ACTION="ACTION"),
+            "PolicyFeature": SimpleNamespace,
+        },
         "lerobot.policies": {},
         "lerobot.policies.common": {},
         "lerobot.policies.common.vla_utils": {"resize_with_pad_torch": _refuse},
@@ -74,15 +80,26 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Any:
         module = ModuleType(name)
         module.__dict__.update(content)
         monkeypatch.setitem(sys.modules, name, module)
-    names = (
-        "lerobot_policy_turbopi",
-        *(f"lerobot_policy_turbopi.{part}_turbopi" for part in ("configuration", "modeling")),
-    )
+    parts = ("real_time", "server", "configuration_turbopi", "modeling_turbopi")
+    names = ("lerobot_policy_turbopi", *(f"lerobot_policy_turbopi.{part}" for part in parts))
     for name in names:  # imported anew, and gone with the test
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
         del sys.modules[name]
     monkeypatch.syspath_prepend(PLUGIN)
     return importlib.import_module(names[-1])
+
+
+def rtc_config(
+    schedule: str = "LINEAR", execution_horizon: int = 10, max_guidance_weight: float = 10.0, **more: Any
+) -> SimpleNamespace:
+    """LeRobot's RTCConfig, as its rollout puts it into a policy's config; the main branch's has a mode, too."""
+    return SimpleNamespace(
+        enabled=True,
+        prefix_attention_schedule=SimpleNamespace(name=schedule),
+        execution_horizon=execution_horizon,
+        max_guidance_weight=max_guidance_weight,
+        **more,
+    )
 
 
 def _features(described: dict[str, Any]) -> dict[str, Any]:

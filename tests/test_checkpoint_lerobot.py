@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import PRESETS, GemmaConfig, Normalization, RealTime, VisionConfig
+from turbopi.preprocess.tokenizer import prompt_texts
 from turbopi.robots import create_robot
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
@@ -455,14 +456,24 @@ def test_a_declared_tokenizer_that_is_missing_or_outside_is_refused(tmp_path: Pa
             open_checkpoint(folder)
 
 
-def test_a_prompt_without_the_state_is_refused(tmp_path: Path) -> None:
-    """LeRobot's main branch may save so what it trains with proprioceptive memory."""
+def test_a_prompt_has_the_state_or_not_as_the_preprocessor_says(tmp_path: Path) -> None:
+    """LeRobot's main branch leaves it out where the state has tokens of its own. A turbopi.json chooses the other."""
     folder, name = lerobot_copy(tmp_path / "c"), "pi05_prepare_state_tokenizer_processor_step"
-    edit_json(folder / PRE, lambda c: step(c, name)["config"].update(include_state_in_prompt=True))
-    open_checkpoint(folder)
-    edit_json(folder / PRE, lambda c: step(c, name)["config"].update(include_state_in_prompt=False))
-    with pytest.raises(CheckpointError, match="include_state_in_prompt is false"):
-        open_checkpoint(folder)
+    texts = []
+    for included, settings in ((True, {}), (False, {}), (False, {"discrete_state_input": True})):
+        edit_json(folder / PRE, lambda c, to=included: step(c, name)["config"].update(include_state_in_prompt=to))
+        write_json(folder / "turbopi.json", settings)
+        checkpoint = open_checkpoint(folder)
+        config = checkpoint.config
+        state = np.zeros(2) if config.discrete_state_input else None
+        texts += prompt_texts(" pick_it up\n", state, as_is=config.prompt_as_is, labels=config.prompt_labels)
+        assert any("include_state_in_prompt = false" in note for note in checkpoint.info()["notes"]) is not included
+    with_state = ("Task: pick it up, State: 128 128;\nAction: ", True)
+    assert texts == [with_state, ("Task: pick it up;\nAction: ", True), with_state]
+    write_json(folder / "turbopi.json", {})
+    convert(folder, tmp_path / "converted", precision="f32")
+    again = open_checkpoint(tmp_path / "converted").config
+    assert (again.discrete_state_input, again.prompt_labels) == (False, True)
 
 
 def test_tensors_are_named_with_lerobots_prefix(tmp_path: Path) -> None:
@@ -472,3 +483,26 @@ def test_tensors_are_named_with_lerobots_prefix(tmp_path: Path) -> None:
         CheckpointError, match=r"missing model.time_mlp_in.bias; not a part of the model: model.critic.b"
     ):
         open_checkpoint(folder)
+
+
+def test_averaged_weights_beside_a_checkpoint_are_read_and_named(tmp_path: Path) -> None:
+    """LeRobot's training with --ema.enable=true saves both."""
+    training = tmp_path / "005000"
+    training.mkdir()
+    for name in ("pretrained_model", "pretrained_model_ema"):
+        lerobot_copy(training / name)
+    (note,) = [note for note in open_checkpoint(training).info()["notes"] if "EMA" in note]
+    assert note == f"training also kept averaged weights (EMA): to run these, give {training / 'pretrained_model_ema'}"
+    averaged = open_checkpoint(training / "pretrained_model_ema")
+    assert averaged.path.name == "pretrained_model_ema" and not any("EMA" in note for note in averaged.info()["notes"])
+
+
+def test_shards_of_distributed_training_are_refused_with_the_command_that_converts_them(tmp_path: Path) -> None:
+    (tmp_path / "005000").mkdir()
+    folder = lerobot_copy(tmp_path / "005000" / "pretrained_model")
+    (folder / "model.safetensors").unlink()
+    (folder / "pytorch_model_fsdp_0").mkdir()
+    (folder / "pytorch_model_fsdp_0" / "__0_0.distcp").touch()
+    for given in (folder, folder.parent):
+        with pytest.raises(CheckpointError, match=f"lerobot-convert-dcp --checkpoint_dir={folder}"):
+            open_checkpoint(given)

@@ -1,11 +1,18 @@
 """What LeRobot's own code computed from checkpoints that it saved; see golden_lerobot/README.md."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from checkpoint_helpers import edit_json
-from lerobot_golden import GOLDEN, GoldenCase
+from lerobot_golden import GOLDEN, GoldenCase, _observation
 from safetensors.torch import load_file
+
+from turbopi import UnifiedPolicy
+from turbopi.checkpoint.lerobot import SCHEDULES
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.realtime.running_chunk import RunningChunk
 
 CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))
 
@@ -52,3 +59,34 @@ def test_actions_that_stay_relative_are_noticed(tmp_path: Path) -> None:
         checkpoint / "policy_postprocessor.json", lambda content: content["steps"][1]["config"].update(enabled=False)
     )
     assert case.wrong(checkpoint).keys() == {"actions"}
+
+
+def test_running_chunks_are_joined_as_lerobot_joins_its_left_overs(tmp_path: Path) -> None:
+    """Of relative actions: moved to the new state here or by LeRobot, padded as any of its versions does."""
+    case = GoldenCase(GOLDEN / "relative_excluded")
+    checkpoint = case.assemble(tmp_path)
+    edit_json(checkpoint / "config.json", lambda content: content.update(rtc_training_max_delay=4))
+    policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", tokenizer=TINY_TOKENIZER)
+    inputs, stored = np.load(case.folder / "inputs.npz"), np.load(case.folder / "rtc.npz")
+    observation = _observation(inputs, 0)
+    old, new = observation["observation.state"][:7], stored["state"][:7]  # as wide as the actions
+    observation["observation.state"] = stored["state"]
+    for index, run in enumerate(json.loads((case.folder / "rtc.json").read_text())["runs"]):
+        row, end, trained = run["row"], run["execution_horizon"], run["mode"] == "trained"
+        for left_over, anchor in (
+            (stored[f"{index}/left_over"], new),
+            (stored["first/model_actions"][row : row + end], old),  # none is padded
+        ):
+            if anchor is old and len(left_over) < end and not trained:
+                continue
+            previous = RunningChunk(
+                np.pad(left_over, ((0, 0), (0, 32 - left_over.shape[1]))),
+                min(run["inference_delay"], end),
+                None if trained else 10 - end,
+                "rtc_trained" if trained else "rtc_identity",
+                anchor,
+                SCHEDULES[run["schedule"]],
+                10.0,
+            )
+            actions = policy.infer(observation, noise=inputs["noise"], previous=previous)["actions"]
+            np.testing.assert_allclose(actions, stored[f"{index}/actions"], atol=1e-5, err_msg=str(run))

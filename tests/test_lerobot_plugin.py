@@ -21,6 +21,7 @@ from lerobot_golden import GOLDEN, GoldenCase
 from turbopi import UnifiedPolicy, open_checkpoint
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.robots.raw_keys import ROBOT_TYPES
+from turbopi.serve import running
 
 pytestmark = pytest.mark.slow
 
@@ -206,9 +207,65 @@ def test_lerobots_own_policy_server_is_not_said_to_take_the_plugin() -> None:
     assert "'pi05'" in done.stdout and "turbopi" not in done.stdout
 
 
-def test_rtc_is_refused_by_lerobot_and_says_what_to_use(ran: Path) -> None:
-    done = in_lerobot(
-        *("-m", "lerobot_cases.cli", "rollout", "--robot.type=fake_arm", "--duration=1", "--inference.type=rtc"),
-        *("--policy.type=turbopi", f"--policy.checkpoint={ran / 'mean_std' / 'checkpoint'}"),
+ROLLOUT = (
+    *("-m", "lerobot_cases.cli", "rollout", "--robot.type=fake_arm", "--duration=2", "--task=pick up the bowl"),
+    *("--play_sounds=false", "--return_to_initial_position=false"),
+)
+RTC = ("--inference.type=rtc", "--inference.rtc.execution_horizon=6", "--inference.queue_threshold=8")
+
+
+def moved(done: subprocess.CompletedProcess[str]) -> int:
+    """How many actions the robot was sent. Fails if LeRobot did, or if its engine met with an error."""
+    assert done.returncode == 0 and "RTC inference error" not in done.stderr, done.stderr[-4000:]
+    sent = re.search(r"fake_arm was sent (\d+) actions", done.stdout)
+    assert sent is not None
+    return int(sent[1])
+
+
+@pytest.fixture(scope="module")
+def joining(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...]]:
+    """A checkpoint with relative actions, which LeRobot runs with RTC alone, and the modes that it can have there.
+
+    0.6.1 has no mode "trained", and refuses a config.json that says how a checkpoint was trained for it.
+    """
+    checkpoint = GoldenCase(GOLDEN / "relative_excluded").assemble(tmp_path_factory.mktemp("joining"))
+    asked = in_lerobot(
+        "-c", "from lerobot.policies.pi05 import PI05Config as C; print(hasattr(C, 'use_visual_memory'))"
     )
-    assert done.returncode != 0 and "RTC inference is not supported by policy type 'turbopi'" in done.stderr
+    assert asked.returncode == 0, asked.stderr[-4000:]
+    if "True" not in asked.stdout:
+        return checkpoint, ("guided",)
+    edit_json(checkpoint / "config.json", lambda content: content.update(rtc_training_max_delay=4))
+    return checkpoint, ("guided", "trained")
+
+
+def test_lerobot_rollout_joins_chunks_with_the_plugin(joining: tuple[Path, tuple[str, ...]]) -> None:
+    checkpoint, modes = joining
+    for mode in modes:
+        policy = ("--policy.type=turbopi", f"--policy.checkpoint={checkpoint}", "--policy.num_inference_steps=2")
+        assert moved(in_lerobot(*ROLLOUT, *RTC, *policy, f"--policy.rtc_mode={mode}")) > 10
+
+
+def test_lerobot_rollout_moves_a_robot_by_a_server(joining: tuple[Path, tuple[str, ...]]) -> None:
+    """With LeRobot's RTC and without, over loopback; LeRobot has neither the weights nor the processors."""
+    checkpoint, _ = joining
+    policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", tokenizer=TINY_TOKENIZER)
+    with running(policy) as server:
+        for engine in (RTC, ("--inference.type=sync",)):
+            remote = ("--policy.type=turbopi", f"--policy.server=ws://127.0.0.1:{server.port}")
+            assert moved(in_lerobot(*ROLLOUT, *engine, *remote)) > 10
+
+
+def test_chunks_join_as_those_of_lerobots_own_policy(joining: tuple[Path, tuple[str, ...]], tmp_path: Path) -> None:
+    """By LeRobot's own re-anchoring, and as the numbers that are stored."""
+    (checkpoint, modes), case, found = joining, GOLDEN / "relative_excluded", {}
+    for who, option in (("own", ()), ("plugin", ("--plugin",))):
+        (tmp_path / who).mkdir()
+        done = in_lerobot("-m", "lerobot_cases.rtc", checkpoint, case / "inputs.npz", tmp_path / who, *option)
+        assert done.returncode == 0, done.stderr[-4000:]
+        found[who] = dict(np.load(tmp_path / who / "rtc.npz"))
+    stored = dict(np.load(case / "rtc.npz"))
+    assert found["plugin"].keys() == found["own"].keys() and len(found["own"]) == 3 + 3 * (6 if len(modes) == 1 else 9)
+    for name, value in found["plugin"].items():
+        for other in (stored, found["own"]):
+            assert difference(value, other[name]) < 1e-5, name

@@ -201,6 +201,8 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,
     }
+    if config.prompt_labels:
+        values["prompt_labels"] = True
     if config.real_time != RealTime():
         values["real_time"] = asdict(config.real_time)
     if config.solver != "euler":

@@ -41,7 +41,7 @@ _MODES: dict[str, NormMode] = {
     "MIN_MAX": "lerobot_min_max",
     "IDENTITY": "identity",
 }
-_SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
+SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 _VARIANTS = ("gemma_300m", "gemma_2b")
@@ -98,10 +98,11 @@ class LeRobotFolder:
             robot="lerobot",
             normalization=self.normalization,
             robot_options=self._robot_options(),
-            discrete_state_input=FAMILIES[self.kind].state_in_prompt,
+            discrete_state_input=self.pipelines.state_in_prompt,
             image_resize="lerobot_0.4" if old else "lerobot",
             prompt_state_dim=self.pipelines.prompt_width or None if old else None,
             prompt_as_is=not FAMILIES[self.kind].state_in_prompt,
+            prompt_labels=FAMILIES[self.kind].state_in_prompt and not self.pipelines.state_in_prompt,
             num_denoising_steps=self.config.integer(
                 "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
             ),
@@ -215,7 +216,7 @@ class LeRobotFolder:
         return RealTime(
             trained_max_delay=trained,
             execution_horizon=horizon - end if end < horizon else None,
-            schedule=_SCHEDULES[rtc.choice("prefix_attention_schedule", tuple(_SCHEDULES), default="LINEAR")],
+            schedule=SCHEDULES[rtc.choice("prefix_attention_schedule", tuple(SCHEDULES), default="LINEAR")],
             max_guidance_weight=rtc.number("max_guidance_weight", 0, 1e6, default=10.0),
         )
 

@@ -97,6 +97,7 @@ class Pipelines:
     tokenizer       the folder that the tokenizer's name points to, in the checkpoint or elsewhere on this machine.
                     None: it is PaliGemma's, by its name
     notes           what isn't sure about them
+    state_in_prompt whether prompts have the state: always Pi0.5's of LeRobot to 0.6.1, never Pi0's
     prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
                     0 for Pi0, which writes none
     """
@@ -108,14 +109,15 @@ class Pipelines:
         self._check_task_keys()
         self.max_tokens = self._tokenizer()
         self.tokenizer = self._named_tokenizer(folder)
-        self.prompt_width = 0
+        self.prompt_width, self.state_in_prompt = 0, False
         if FAMILIES[kind].state_in_prompt:
             state_step = self.steps[STATE_STEP]
             self.prompt_width = state_step.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
-            if not state_step.config.flag("include_state_in_prompt", True):
-                raise CheckpointError(
-                    f"{state_step.file}: include_state_in_prompt is false, as for proprioceptive memory; Turbo-Pi "
-                    "writes the state into Pi0.5's prompt"
+            self.state_in_prompt = state_step.config.flag("include_state_in_prompt", True)
+            if not self.state_in_prompt:
+                self.notes.append(
+                    f"{PREPROCESSOR} says include_state_in_prompt = false: prompts have no state. If the policy was "
+                    'trained with it, put {"discrete_state_input": true} into a turbopi.json'
                 )
 
     def relative_mask(self, action_dim: int) -> list[bool] | None:

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
-from turbopi.checkpoint.missing_files import INTERRUPTED, PRETRAINED, holds_weights, nothing_here, unfinished_save
+from turbopi.checkpoint.missing_files import (
+    AVERAGED,
+    INTERRUPTED,
+    PRETRAINED,
+    holds_weights,
+    nothing_here,
+    unfinished_save,
+)
 from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
@@ -102,7 +109,10 @@ def _notes(folder: Path, read: CheckpointFormat, *, adapter: bool = False) -> tu
     owner = {"openpi_jax": "openpi", "openpi_torch": "openpi", "lerobot": "LeRobot"}.get(read)
     as_owner = f", as by {owner}" if owner else ""
     verb = "are" if used.startswith("the ") else "is"
+    averaged = folder.parent / f"{folder.name}{AVERAGED}"
     notes = [f"two sources of weights: {used} {verb} read{as_owner}, and not {file}" for file in others if others[file]]
+    if holds_weights(averaged):
+        notes.append(f"training also kept averaged weights (EMA): to run these, give {averaged}")
     return (*notes, *([f"{folder.name} is {INTERRUPTED}"] if unfinished_save(folder.name) else []))
 
 

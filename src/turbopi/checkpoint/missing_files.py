@@ -6,11 +6,13 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
+from turbopi.checkpoint.lerobot import is_lerobot
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
 from turbopi.support.reading import files_below, listing
 
 PRETRAINED = "pretrained_model"  # of one step of LeRobot's training
+AVERAGED = "_ema"  # behind its name: LeRobot's main branch keeps the averaged weights so
 _PICKLES = (".bin", ".pt", ".pth", ".ckpt", ".pkl", ".distcp")
 # what training keeps beside weights, to go on with
 _OF_TRAINING = re.compile(r"optim|sched|^metadata|rng_state|random_state|training_|trainer_|scaler", re.IGNORECASE)
@@ -130,6 +132,11 @@ def _pickled(files: Iterator[Path]) -> list[Path]:
 
 
 def _unpickle(file: Path) -> str:
+    if file.suffix == ".distcp" and is_lerobot(file.parent.parent):
+        return (
+            "shards of LeRobot's distributed training, which are pickled and aren't read. In LeRobot's environment: "
+            f"lerobot-convert-dcp --checkpoint_dir={file.parent.parent}"
+        )
     if file.suffix == ".distcp":
         how = f"python -m torch.distributed.checkpoint.format_utils dcp_to_torch {file.parent} whole.pt, then "
         file = Path("whole.pt")

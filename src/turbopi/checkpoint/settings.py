@@ -18,6 +18,7 @@ itself.
     image_resize          "openpi", "lerobot", or "lerobot_0.4", which pads pictures with -3 instead of -1
     prompt_state_dim      zeros fill the state up to so many numbers in the prompt (LeRobot 0.4: 32); null: nothing does
     prompt_as_is          true if Pi0's prompts keep their blanks, underscores and newlines, as in LeRobot
+    prompt_labels         true if Pi0.5's prompts without a state keep "Task: " and "Action: ", as in LeRobot
     lerobot_semantics     of LeRobot's checkpoints alone: "0.4", "0.6" (0.5, too), or "auto" for the one that wrote it
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
@@ -130,6 +131,7 @@ _OF_POLICY = (
     "image_resize",
     "prompt_state_dim",
     "prompt_as_is",
+    "prompt_labels",
     "num_denoising_steps",
     "solver",
     "solver_grid",
@@ -344,6 +346,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "image_resize": ("'openpi', 'lerobot' or 'lerobot_0.4'", _choice("openpi", "lerobot", "lerobot_0.4")),
     "prompt_state_dim": _count_or_null(LIMITS["action_dim"]),
     "prompt_as_is": ("true or false", _flag),
+    "prompt_labels": ("true or false", _flag),
     "lerobot_semantics": ("'0.4', '0.6' or 'auto'", _choice("0.4", "0.6", "auto")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
     "num_denoising_steps": _count(LIMITS["num_denoising_steps"]),

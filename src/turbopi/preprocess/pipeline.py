@@ -28,6 +28,7 @@ from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.base import all_finite, keys_of, listed, read_prompt, read_state
 from turbopi.robots.images import check_hwc, is_rgb8, to_uint8
+from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.plain import Plain
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
@@ -250,7 +251,7 @@ class Pipeline:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What a client may want to know of the robot, in plain values; `reset_pose` only if the robot has one."""
+        """What a client may want to know of the robot, in plain values; what only some robots have if this one does."""
         described: dict[str, object] = {
             "robot": self.robot.name,
             "robot_state_dim": self.robot.state_dim,
@@ -259,6 +260,8 @@ class Pipeline:
         }
         if self.robot.reset_pose is not None:
             described["reset_pose"] = list(self.robot.reset_pose)
+        if isinstance(self.robot, LeRobot):
+            described |= self.robot.features
         return described
 
     # Before the model
@@ -316,6 +319,7 @@ class Pipeline:
             state,
             max_tokens=self.config.model.max_prompt_tokens,
             as_is=self.config.prompt_as_is,
+            labels=self.config.prompt_labels,
         )
 
     def _pad_state(self, sample: Incoming) -> None:

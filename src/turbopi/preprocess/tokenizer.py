@@ -47,13 +47,15 @@ def state_bins(state: np.ndarray) -> np.ndarray:
     return np.asarray(_STATE_EDGES.searchsorted(state, side="right") - 1)
 
 
-def prompt_texts(prompt: str, state: np.ndarray | None, *, as_is: bool = False) -> list[tuple[str, bool]]:
-    """What is encoded, in order: (text, whether BOS goes before it). `as_is`: a prompt without state isn't cleaned."""
+def prompt_texts(
+    prompt: str, state: np.ndarray | None, *, as_is: bool = False, labels: bool = False
+) -> list[tuple[str, bool]]:
+    """What is encoded, in order: (text, whether BOS goes before it). `as_is` and `labels`: see `encode`."""
     if as_is and state is None:
         return [(prompt if prompt.endswith("\n") else prompt + "\n", True)]
     cleaned = clean_prompt(prompt)
     if state is None:
-        return [(cleaned, True), ("\n", False)]
+        return [(f"Task: {cleaned};\nAction: ", True)] if labels else [(cleaned, True), ("\n", False)]
     numbers = " ".join(map(str, state_bins(state).tolist()))
     return [(f"Task: {cleaned}, State: {numbers};\nAction: ", True)]
 
@@ -71,10 +73,13 @@ class PromptTokenizer:
         self._truncated_prompt: str | None = None  # warned about last
         self._newline: list[int] | None = None  # Pi0's, which is encoded by itself: always the same
 
-    def encode(self, prompt: str, state: np.ndarray | None = None, *, as_is: bool = False) -> list[int]:
+    def encode(
+        self, prompt: str, state: np.ndarray | None = None, *, as_is: bool = False, labels: bool = False
+    ) -> list[int]:
         """All ids of `prompt`, neither padded nor truncated. `state` [d], normalised, goes into the text.
 
         as_is   a prompt without state keeps its blanks, underscores and newlines, as in LeRobot's Pi0
+        labels  a prompt without state keeps "Task: " and "Action: ", as in LeRobot's Pi0.5
 
         Raises ObservationError for a prompt that can't be encoded, TokenizerError for ids past the vocabulary.
         """
@@ -84,7 +89,7 @@ class PromptTokenizer:
             prompt.encode()
         except UnicodeEncodeError as error:
             raise ObservationError(f"the prompt isn't valid Unicode text: {error}") from error
-        (text, bos), *newline = prompt_texts(prompt, state, as_is=as_is)
+        (text, bos), *newline = prompt_texts(prompt, state, as_is=as_is, labels=labels)
         ids = self._ids(text, bos)
         if newline:
             self._newline = self._newline or self._ids(*newline[0])
@@ -101,13 +106,19 @@ class PromptTokenizer:
         return list(map(int, self.encoder.encode(text, add_bos=add_bos)))
 
     def tokenize(
-        self, prompt: str, state: np.ndarray | None = None, *, max_tokens: int, as_is: bool = False
+        self,
+        prompt: str,
+        state: np.ndarray | None = None,
+        *,
+        max_tokens: int,
+        as_is: bool = False,
+        labels: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
-        `as_is`: see `encode`. A longer prompt loses its end, as in openpi; a warning is logged, once for each.
+        `as_is`, `labels`: see `encode`. A longer prompt loses its end, as in openpi; a warning is logged once for each.
         """
-        ids = self.encode(prompt, state, as_is=as_is)
+        ids = self.encode(prompt, state, as_is=as_is, labels=labels)
         count = min(len(ids), max_tokens)
         if count < len(ids):
             self._warn_truncated(prompt, len(ids), max_tokens, state is not None)

@@ -104,7 +104,7 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptio
             "that joins nothing"
         )
     delay = _whole(given, "delay", 0)
-    horizon = _whole(given, "execution_horizon", 1)
+    horizon = _whole(given, "execution_horizon", 0 if mode == "rtc_identity" and "previous" in given else 1)
     guidance = _guidance(given)
     session = given.get("session")
     if session is not None and not (isinstance(session, str) and 0 < len(session) <= MAX_SESSION):

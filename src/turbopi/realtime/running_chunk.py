@@ -20,12 +20,15 @@ class RunningChunk:
     """What is left of the running chunk when an observation is taken, as `UnifiedPolicy.infer` is told of it.
 
     left_over          float32[K, action_dim], 1 ≤ K ≤ H, in the model's normalised space, as `infer` returned it under
-                       "model_actions"; row 0 is the action that the robot carries out at the observation's time
+                       "model_actions"; row 0 is the action that the robot carries out at the observation's time.
+                       LeRobot's engine pads one that is shorter than e below: with zeros up to 0.6.1, with its last
+                       action since pull request 4454. For its numbers in "rtc_identity" pad it so
     delay              d, control steps: how many of these actions will be carried out before the new chunk arrives
     execution_horizon  s, control steps: how many actions of a chunk are carried out before the next takes over. Guided
                        modes pull towards the left-over before H − s; d ≤ H − s. None: the policy's, cut to H − d, or
                        where it has none the whole left-over: max(H − K, d, 1). With "rtc_identity" None is as in
-                       LeRobot, whose mask ends at e = H − s of the policy's s, or at K: the delay is cut to it
+                       LeRobot, whose mask ends at e = H − s of the policy's s, or at K: the delay is cut to it. There 0
+                       is allowed, too: LeRobot's e of H or more
     mode               "rtc": guided, with the true Jacobian (arXiv 2506.07339). "rtc_identity": guided as LeRobot 0.6
                        computes it. "rtc_trained": the first d actions are held (arXiv 2512.05964), for checkpoints
                        that were trained so
@@ -63,7 +66,8 @@ class RunningChunk:
         limit = LIMITS["action_horizon"]
         delay = _whole("the delay", self.delay, 0, limit)
         given = self.execution_horizon
-        s = None if given is None else _whole("the execution horizon", given, 1, limit)
+        least = 0 if self.mode == "rtc_identity" else 1
+        s = None if given is None else _whole("the execution horizon", given, least, limit)
         rows = len(left_over)
         if delay > rows:
             raise ObservationError(

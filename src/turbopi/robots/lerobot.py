@@ -93,6 +93,14 @@ class LeRobot(Robot):
         return None if self.relative_dims is None else tuple(self.relative_dims)
 
     @property
+    def features(self) -> dict[str, object]:
+        """What LeRobot on a robot's computer needs to know of the checkpoint: a part of the policy's metadata."""
+        return {
+            "robot_cameras": list(map(self.sent_as, self.image_keys)),
+            "robot_action_names": None if self.action_names is None else list(self.action_names),
+        }
+
+    @property
     def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
         return tuple(range(1, len(self.image_keys) + 1))
 

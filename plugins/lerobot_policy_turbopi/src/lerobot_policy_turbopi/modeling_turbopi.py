@@ -19,7 +19,10 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
+from lerobot_policy_turbopi import real_time
 from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiConfig
+from lerobot_policy_turbopi.real_time import Join, read_join
+from lerobot_policy_turbopi.server import PROCESSORS, ServedModel
 from turbopi import UnifiedPolicy, open_checkpoint
 from turbopi.models import family_of
 from turbopi.models.observation import Observation
@@ -36,7 +39,11 @@ class TurboPiPolicy(PreTrainedPolicy):
 
     turbopi   the policy that runs the model; None: made from `config`. Its robot, statistics and tokenizer aren't used
 
-    Raises what `turbopi.UnifiedPolicy` raises, and ConfigError without a checkpoint.
+    With a server in `config` the model runs there: what is called a batch is then the robot's, what is called
+    normalised are the robot's actions, and LeRobot's processors change nothing.
+
+    Raises what `turbopi.UnifiedPolicy` and `turbopi.realtime.RealTimeClient` raise, and ConfigError without a
+    checkpoint.
     """
 
     config_class = TurboPiConfig
@@ -45,7 +52,8 @@ class TurboPiPolicy(PreTrainedPolicy):
     def __init__(self, config: TurboPiConfig, turbopi: UnifiedPolicy | None = None, **unused: Any) -> None:
         super().__init__(config)  # unused: LeRobot hands statistics of data sets to every policy
         self.config = config
-        self.turbopi = load(config) if turbopi is None else turbopi
+        self.served = ServedModel(config.server) if config.server is not None else None
+        self.turbopi = load(config) if turbopi is None and self.served is None else turbopi
         self._actions: deque[Tensor] = deque()
         self.eval()
 
@@ -65,9 +73,40 @@ class TurboPiPolicy(PreTrainedPolicy):
             config = TurboPiConfig(checkpoint=str(pretrained_name_or_path), pretrained_revision=revision)
         return cls(config)
 
+    def supports_rtc(self) -> bool:
+        """Whether `--inference.type=rtc` runs it: LeRobot's main branch calls this."""
+        return True
+
+    def init_rtc_processor(self) -> None:
+        """LeRobot calls it once `config.rtc_config` is set, before the robot is connected.
+
+        Raises ConfigError if this policy can't join chunks in the config's mode. Warms up the calls that do.
+        """
+        if not real_time.enabled(self.config.rtc_config):
+            return
+        mode = real_time.mode_of(self.config)
+        offered = self.served.modes if self.served is not None else self._local.metadata["real_time"]["modes"]
+        if mode not in offered:
+            where = f"the server at {self.config.server}" if self.served is not None else "this backend"
+            raise ConfigError(
+                f"rtc_mode {self.config.rtc_mode!r} needs the way to join chunks {mode!r}, and {where} has "
+                f"{', '.join(offered) or 'none'}. Use backend 'fused', 'cuda_graph' or 'pytorch', or "
+                "--inference.type=sync"
+            )
+        if self.served is None and self.config.warmup:
+            self._local.warmup(horizons=self.config.chunk_size, real_time=mode)
+
+    @torch.compiler.disable  # Turbo-Pi compiles for itself
     @torch.no_grad()
     def predict_action_chunk(
-        self, batch: dict[str, Tensor], noise: Tensor | None = None, num_steps: int | None = None
+        self,
+        batch: dict[str, Tensor],
+        noise: Tensor | None = None,
+        num_steps: int | None = None,
+        *,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
     ) -> Tensor:
         """A preprocessed batch to normalised actions float32[B, chunk_size, actions], on the batch's device.
 
@@ -75,29 +114,39 @@ class TurboPiPolicy(PreTrainedPolicy):
                    same seed of PyTorch gives the same noise
         num_steps  denoising steps; None: the config's num_inference_steps
 
-        Raises ObservationError for a batch without pictures or tokens, noise of another shape and steps that can't be;
-        ActionError for actions that aren't finite.
+        With RTC (`config.rtc_config` set and enabled), as LeRobot's own pi05 and pi0 take them:
+
+        prev_chunk_left_over  float32[K, actions] or [B, K, actions]: what is left of the last answer when the
+                              observation is taken; None: nothing is joined
+        inference_delay       how many of these are carried out before the answer arrives; more than can be joined are
+                              cut to that, with a warning
+        execution_horizon     of this call; None: the rtc_config's
+
+        Raises ObservationError for a batch without images or tokens, noise of another shape and for steps, left-overs
+        and delays that can't be; ActionError for actions that aren't finite.
         """
-        inputs = self._inputs(batch)
-        device = inputs.tokens.device
-        shape = (inputs.batch_size, self.config.chunk_size, self.config.max_action_dim)
-        if noise is None:
-            noise = torch.normal(mean=0.0, std=1.0, size=shape, dtype=torch.float32, device=device)
-        if noise.shape != shape:
-            raise ObservationError(f"noise has shape {list(noise.shape)}, but this policy needs {list(shape)}")
-        steps = cast(int, self.config.num_inference_steps) if num_steps is None else num_steps
-        with torch.inference_mode(False):  # buffers made inside it would be of no use outside
-            actions = self.turbopi.backend.sample(inputs, noise, checked_steps(steps, ObservationError)).actions
-        if not actions.isfinite().all():
-            raise ActionError("the model computed actions that aren't finite; `turbopi verify` compares backends")
-        return actions[..., : self.config.output_features[ACTION].shape[0]].to(device)
+        if self.served is None:
+            inputs = self._inputs(batch)
+            join = read_join(self.config, inputs.batch_size, prev_chunk_left_over, inference_delay, execution_horizon)
+            return self._computed(inputs, noise, num_steps, join)
+        if noise is not None or num_steps is not None:
+            raise ObservationError("noise and num_steps were given, but the server decides about both: leave them out")
+        if OBS_STATE not in batch:
+            raise ObservationError(f"the batch has no {OBS_STATE!r}; it has {', '.join(batch)}")
+        state = batch[OBS_STATE]
+        join = read_join(self.config, len(state), prev_chunk_left_over, inference_delay, execution_horizon)
+        return self.served.chunk(batch, len(state), join).to(state.device)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
         """One action [B, actions]: the next of the chunk, or the first one of a new one once n_action_steps are used.
 
-        `options` are `predict_action_chunk`'s.
+        `options` are `predict_action_chunk`'s. Raises ConfigError with RTC, whose chunks LeRobot joins itself.
         """
+        if real_time.enabled(self.config.rtc_config):
+            raise ConfigError(
+                "select_action and RTC don't go together: call predict_action_chunk, as LeRobot's engine does"
+            )
         if not self._actions:
             chunk = self.predict_action_chunk(batch, **options)[:, : self.config.n_action_steps]
             self._actions.extend(chunk.transpose(0, 1))
@@ -106,6 +155,8 @@ class TurboPiPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Forget the rest of the chunk: the next `select_action` looks at its observation."""
         self._actions.clear()
+        if self.served is not None:
+            self.served.reset()
 
     def drop_queued_actions(self) -> None:
         """The same. LeRobot after 0.6.1 calls it within an episode, when the task changes; no other state is kept."""
@@ -119,10 +170,12 @@ class TurboPiPolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """The options, the processors and what lies beside them, for --policy.path; the weights stay where they are."""
-        assert self.config.checkpoint is not None
-        folder = local_folder(self.config)
-        named = self.config.checkpoint if not Path(self.config.checkpoint).is_dir() else str(folder.absolute())
-        replace(self.config, checkpoint=named)._save_pretrained(save_directory)
+        folder, config = PROCESSORS, self.config
+        if config.checkpoint is not None:
+            folder = local_folder(config)
+            if Path(config.checkpoint).is_dir():
+                config = replace(config, checkpoint=str(folder.absolute()))
+        config._save_pretrained(save_directory)
         for file in folder.glob("policy_*processor*"):
             shutil.copy(file, save_directory)
             for artifact in _artifacts(file) if file.suffix == ".json" else ():
@@ -134,6 +187,30 @@ class TurboPiPolicy(PreTrainedPolicy):
                     shutil.copy(source, target)
 
     # -- a batch in the model's words ----------------------------------------------------------------------------------
+
+    @property
+    def _local(self) -> UnifiedPolicy:
+        assert self.turbopi is not None
+        return self.turbopi
+
+    def _computed(self, inputs: Observation, noise: Tensor | None, num_steps: int | None, join: Join | None) -> Tensor:
+        device = inputs.tokens.device
+        shape = (inputs.batch_size, self.config.chunk_size, self.config.max_action_dim)
+        if noise is None:
+            noise = torch.normal(mean=0.0, std=1.0, size=shape, dtype=torch.float32, device=device)
+        if noise.shape != shape:
+            raise ObservationError(f"noise has shape {list(noise.shape)}, but this policy needs {list(shape)}")
+        steps = checked_steps(
+            cast(int, self.config.num_inference_steps) if num_steps is None else num_steps, ObservationError
+        )
+        joined: dict[str, Any] = {}
+        if join is not None:
+            joined["conditioning"] = [join.conditioning(row, steps, *shape[1:]) for row in range(shape[0])]
+        with torch.inference_mode(False):  # buffers made inside it would be of no use outside
+            actions = self._local.backend.sample(inputs, noise, steps, **joined).actions
+        if not actions.isfinite().all():
+            raise ActionError("the model computed actions that aren't finite; `turbopi verify` compares backends")
+        return actions[..., : self.config.output_features[ACTION].shape[0]].to(device)
 
     def _inputs(self, batch: dict[str, Tensor]) -> Observation:
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK):
@@ -168,7 +245,7 @@ class TurboPiPolicy(PreTrainedPolicy):
     def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
         """float32[B, max_action_dim]: Pi0's, padded. Pi0.5 has it in the prompt."""
         state = torch.zeros(rows, self.config.max_action_dim)
-        if family_of(self.turbopi.config.model).state_token:
+        if family_of(self._local.config.model).state_token:
             given = batch[OBS_STATE]
             state[:, : given.shape[-1]] = given
         return state
