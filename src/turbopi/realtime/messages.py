@@ -1,8 +1,8 @@
 """What a message to a policy server says about real-time execution: optional keys beside the observation's own.
 
-docs/serving_sessions.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
-ignores them, so a client looks for "real_time" in the server's metadata first. The keys of scheduling (SCHEDULING_KEYS)
-are only named here: serve/requests.py reads them.
+docs/serving_sessions.md has them as a table. Any client of openpi's protocol can send them; a server of another make
+refuses or ignores them, so a client looks for "real_time" in the server's metadata first. The keys of scheduling
+(SCHEDULING_KEYS) are only named here: serve/requests.py reads them.
 """
 
 from collections.abc import Mapping
