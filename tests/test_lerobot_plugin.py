@@ -229,11 +229,11 @@ def joining(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, 
     0.6.1 has no mode "trained", and refuses a config.json that says how a checkpoint was trained for it.
     """
     checkpoint = GoldenCase(GOLDEN / "relative_excluded").assemble(tmp_path_factory.mktemp("joining"))
-    asked = in_lerobot(
+    answer = in_lerobot(
         "-c", "from lerobot.policies.pi05 import PI05Config as C; print(hasattr(C, 'use_visual_memory'))"
     )
-    assert asked.returncode == 0, asked.stderr[-4000:]
-    if "True" not in asked.stdout:
+    assert answer.returncode == 0, answer.stderr[-4000:]
+    if "True" not in answer.stdout:
         return checkpoint, ("guided",)
     edit_json(checkpoint / "config.json", lambda content: content.update(rtc_training_max_delay=4))
     return checkpoint, ("guided", "trained")

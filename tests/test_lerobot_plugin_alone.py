@@ -16,6 +16,7 @@ from lerobot_golden import GOLDEN, GoldenCase, _observation
 
 from turbopi import UnifiedPolicy
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.serve import PolicyServer, running
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 
@@ -358,20 +359,27 @@ class WithNoise:
 
     def __init__(self, policy: UnifiedPolicy, noise: np.ndarray) -> None:
         self._policy, self._noise, self.metadata = policy, noise, policy.metadata
+        self.joined: list[RunningChunk | None] = []
 
     def infer(self, obs: Any, **options: Any) -> dict[str, Any]:
+        self.joined.append(options.get("previous"))
         return self._policy.infer(obs, noise=self._noise, **options)
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PolicyServer]:
-    """`turbopi serve` with a key, of a checkpoint with relative actions that was trained with delays up to 4."""
+def behind_it(tmp_path_factory: pytest.TempPathFactory) -> WithNoise:
+    """A policy with relative actions that was trained with delays up to 4."""
     case = GoldenCase(GOLDEN / "relative_excluded")
     checkpoint = case.assemble(tmp_path_factory.mktemp("served"))
     edit_json(checkpoint / "config.json", lambda content: content.update(rtc_training_max_delay=4))
     policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", tokenizer=TINY_TOKENIZER)
-    noise = np.load(case.folder / "inputs.npz")["noise"]
-    with running(WithNoise(policy, noise), api_key="open-sesame") as server:
+    return WithNoise(policy, np.load(case.folder / "inputs.npz")["noise"])
+
+
+@pytest.fixture(scope="module")
+def server(behind_it: WithNoise) -> Iterator[PolicyServer]:
+    """`turbopi serve` with a key."""
+    with running(behind_it, api_key="open-sesame") as server:
         yield server
 
 
@@ -415,6 +423,16 @@ def test_a_servers_chunks_join_as_lerobots(served: Any) -> None:
         else:
             assert float((chunk[0] - first[0]).abs().max()) > 1e-2
     assert compared == 7
+
+
+def test_a_servers_calls_that_join_are_warm_before_the_robot_moves(served: Any, behind_it: WithNoise) -> None:
+    set_rtc(served, lerobot_fakes.rtc_config(), "trained")
+    plain, joins = behind_it.joined[-2:]
+    assert (
+        plain is None
+        and joins is not None
+        and (joins.mode, joins.delay, len(joins.left_over)) == ("rtc_trained", 1, H - 1)
+    )
 
 
 def test_a_servers_actions_come_one_by_one(served: Any) -> None:

@@ -119,19 +119,19 @@ class TurboPiConfig(PreTrainedConfig):
                     "give it to `turbopi serve` and leave it out here"
                 )
         with connect(cast(str, self.server)) as client:
-            told = client.metadata
-        images = {key: PolicyFeature(type=FeatureType.VISUAL, shape=(3, 224, 224)) for key in told["robot_cameras"]}
-        state = PolicyFeature(type=FeatureType.STATE, shape=(told["robot_state_dim"],))
+            metadata = client.metadata
+        images = {key: PolicyFeature(type=FeatureType.VISUAL, shape=(3, 224, 224)) for key in metadata["robot_cameras"]}
+        state = PolicyFeature(type=FeatureType.STATE, shape=(metadata["robot_state_dim"],))
         return SimpleNamespace(
-            chunk_size=told["action_horizon"],
-            max_action_dim=told["robot_action_dim"],
+            chunk_size=metadata["action_horizon"],
+            max_action_dim=metadata["robot_action_dim"],
             image_resolution=(224, 224),
-            action_feature_names=told.get("robot_action_names"),
-            rtc_training_max_delay=told["real_time"]["trained_max_delay"],
+            action_feature_names=metadata.get("robot_action_names"),
+            rtc_training_max_delay=metadata["real_time"]["trained_max_delay"],
             input_features={**images, "observation.state": state},
-            output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(told["robot_action_dim"],))},
+            output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(metadata["robot_action_dim"],))},
             num_inference_steps=None,
-            n_action_steps=told["action_horizon"],
+            n_action_steps=metadata["action_horizon"],
         )
 
     # what LeRobot's training asks

@@ -93,7 +93,9 @@ class TurboPiPolicy(PreTrainedPolicy):
                 f"{', '.join(offered) or 'none'}. Use backend 'fused', 'cuda_graph' or 'pytorch', or "
                 "--inference.type=sync"
             )
-        if self.served is None and self.config.warmup:
+        if self.served is not None:
+            self.served.warm_up(mode)
+        elif self.config.warmup:
             self._local.warmup(horizons=self.config.chunk_size, real_time=mode)
 
     @torch.compiler.disable  # Turbo-Pi compiles for itself

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lerobot_policy_turbopi.real_time import Join
 from turbopi.realtime.client import RealTimeClient
-from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.support.errors import ConfigError, ObservationError
 
 PROCESSORS = Path(__file__).with_name("remote")
@@ -48,6 +48,18 @@ class ServedModel:
         """The ways to join chunks that the server offers."""
         return list(self._client.metadata["real_time"]["modes"])
 
+    def warm_up(self, mode: JoinMode) -> None:
+        """Call the server until a call that joins chunks is warm there: `turbopi serve` warms up plain calls alone."""
+        described = self._client.metadata
+        black = np.zeros((3, 480, 640), np.uint8)
+        observation: dict[str, Any] = dict.fromkeys(described["robot_cameras"], black)
+        observation |= {"observation.state": np.zeros(described["robot_state_dim"], np.float32), "task": "warm up"}
+        answer = self._client.infer(observation, model_actions=True)
+        left_over = answer["model_actions"][1:]
+        if len(left_over):
+            previous = RunningChunk(left_over, 1, mode=mode, anchor=answer.get("anchor"))
+            self._client.infer(observation, previous=previous, model_actions=True)
+
     def chunk(self, batch: Mapping[str, Any], rows: int, join: Join | None) -> Tensor:
         """float32[B, H, d] in the robot's units, on the CPU. Raises what `RealTimeClient.infer` raises."""
         previous = None if join is None else self._running(join)
@@ -74,7 +86,7 @@ class ServedModel:
         if len(join.left_over) != 1:
             raise ObservationError(f"RTC with a server takes one observation at a time, but {len(join.left_over)} came")
         rows = join.left_over[0]
-        for actions, model_actions, anchor in reversed(self._answers):
+        for actions, model_actions, anchor in reversed(list(self._answers)):  # another thread may reset
             for first in np.flatnonzero((actions[:, : rows.shape[1]] == rows[0]).all(1)):
                 left = min(len(rows), len(actions) - first)
                 padding = rows[left:]
