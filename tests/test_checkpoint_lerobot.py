@@ -494,7 +494,9 @@ def test_averaged_weights_beside_a_checkpoint_are_read_and_named(tmp_path: Path)
     (note,) = [note for note in open_checkpoint(training).info()["notes"] if "EMA" in note]
     assert note == f"training also kept averaged weights (EMA): to run these, give {training / 'pretrained_model_ema'}"
     averaged = open_checkpoint(training / "pretrained_model_ema")
-    assert averaged.path.name == "pretrained_model_ema" and not any("EMA" in note for note in averaged.info()["notes"])
+    assert averaged.path == training / "pretrained_model_ema" and not any(
+        "EMA" in note for note in averaged.info()["notes"]
+    )
 
 
 def test_shards_of_distributed_training_are_refused_with_the_command_that_converts_them(tmp_path: Path) -> None:

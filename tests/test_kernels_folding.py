@@ -317,9 +317,11 @@ def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int, b
     def tower(vision: VisionOps, dtype: torch.dtype, into: Tensor) -> Tensor:
         x = VisionStream(start.to(dtype))
         for layer, following in zip(layers, (layers[1].qkv[0], projector[0]), strict=True):
-            typed = VisionLayer(**{one.name: of(dtype, getattr(layer, one.name)) for one in dataclasses.fields(layer)})
+            parts: dict[str, Any] = {one.name: of(dtype, getattr(layer, one.name)) for one in dataclasses.fields(layer)}
+            typed = VisionLayer(**parts)
             x = vision.layer(typed, x, images=max(rows // 256, 1), heads=16, eps=EPS, following=following)
-        vision.project(x, of(dtype, last), of(dtype, projector), EPS, into)
+        (weight, bias) = last
+        vision.project(x, (weight.to(dtype), bias.to(dtype)), of(dtype, projector), EPS, into)
         return into
 
     ours_by, by_plain = fused_ops(DEVICE).vision, VisionByOps(plain.PLAIN)

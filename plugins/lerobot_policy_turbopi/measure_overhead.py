@@ -56,6 +56,7 @@ def policy_of(arguments: argparse.Namespace) -> TurboPiPolicy:
 def inputs_of(policy: TurboPiPolicy, size: tuple[int, int]) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """An observation as a robot sends it, and the same one as LeRobot's processors leave it."""
     rng, turbopi = np.random.default_rng(0), policy.turbopi
+    assert turbopi is not None
     seen = turbopi.example_observation()
     for key in policy.config.image_features:
         if key in seen:
@@ -85,11 +86,13 @@ def main() -> None:
     height, width = map(int, arguments.size.split("x"))
     policy = policy_of(arguments)
     observation, batch = inputs_of(policy, (height, width))
+    turbopi = policy.turbopi
+    assert turbopi is not None
     noise = np.random.default_rng(1).standard_normal((policy.config.chunk_size, policy.config.max_action_dim))
     noise_on_device = torch.from_numpy(noise.astype(np.float32))[None].to(policy.config.device)
     calls: dict[str, Callable[[], Any]] = {
         "plugin_ms": lambda: policy.predict_action_chunk(batch, noise=noise_on_device).cpu(),
-        "turbopi_ms": lambda: policy.turbopi.infer(observation, noise=noise),
+        "turbopi_ms": lambda: turbopi.infer(observation, noise=noise),
     }
     taken: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(WARM + arguments.calls):
@@ -98,8 +101,8 @@ def main() -> None:
             call()
             taken[name].append((time.perf_counter() - start) * 1e3)
     medians = {name: statistics.median(times[WARM:]) for name, times in taken.items()}
-    told = policy.turbopi.metadata
-    found = {name: told[name] for name in ("device_name", "backend", "precision", "torch")} | medians
+    metadata = turbopi.metadata
+    found = {name: metadata[name] for name in ("device_name", "backend", "precision", "torch")} | medians
     print(json.dumps(found | {"size": arguments.size, "overhead_ms": medians["plugin_ms"] - medians["turbopi_ms"]}))
 
 

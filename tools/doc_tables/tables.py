@@ -28,7 +28,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers_from: 
     return ["| " + " | ".join(head) + " |", f"|{rule}|", *("| " + " | ".join(row) + " |" for row in rows)]
 
 
-def _result(document: BenchDocument, backend: str, precision: str, **job: int) -> Result | None:
+def _result(document: BenchDocument, backend: str, precision: str, **job: Any) -> Result | None:
     wanted = replace(document.main_job, **job)
     for result in document.results:
         if (result.backend, result.precision, result.job) == (backend, precision, wanted):

@@ -43,7 +43,8 @@ class Deferred:
 
     def run(self, stream: Tensor, ahead: Tensor, copy: Copy | None = None) -> tuple[Tensor, Sums]:
         """The residual stream with this GEMM's result, and its rows' sums, in the units of the copy if there is one."""
-        sums = Sums.allocate(self.tile, *stream.shape, stream.device)
+        m, n = stream.shape
+        sums = Sums.allocate(self.tile, m, n, stream.device)
         fused: dict[str, Any] = {"residual": stream, "sums_out": sums, "copy": copy, "ahead": ahead}
         if isinstance(self.weight, ScaledMatrix):
             return matmul_fp8(self.x, self.weight, self.tile, "bias", self.bias, **fused), sums
@@ -98,7 +99,8 @@ class FusedVision:
         if (sms := multiprocessors(x.device)) < GATHERING_SMS:
             return None
         if isinstance(weight, ScaledMatrix):
-            return chosen_fp8(self._tiles, "residual", x.shape[0], *weight.shape, sms)
+            n, k = weight.shape
+            return chosen_fp8(self._tiles, "residual", x.shape[0], n, k, sms)
         return bf16_tile(self._tiles, "residual", x, weight)
 
     def _normed_linear(
@@ -125,11 +127,13 @@ class FusedVision:
             x, normed = layer_norm.residual_layer_norm(x, pending, *norm, eps, takes)
             return VisionStream(x), self._linear(normed, affine, epilogue, inverse, out, ahead)
         if isinstance(weight, ScaledMatrix) and stream.sums is not None:
-            sums = Sums.allocate(pending.tile, *x.shape, x.device)
+            m, n = x.shape
+            sums = Sums.allocate(pending.tile, m, n, x.device)
             scaled = self._for_copies(norm, weight.inverse)
             copy = Copy(torch.empty_like(x, dtype=E4M3), stream.sums, *scaled, eps, sums)
             x, of_copy = pending.run(x, weight.data, copy)
-            tile = chosen_fp8(self._tiles, epilogue, x.shape[0], *weight.shape, multiprocessors(x.device))
+            rows, inner = weight.shape
+            tile = chosen_fp8(self._tiles, epilogue, m, rows, inner, multiprocessors(x.device))
             assert tile is not None and tile.splits == 1, "a norm is multiplied whole"
             tile = replace(tile, overlap=False)  # what follows its sums needs more registers than that leaves
             folded_fp8 = self._fold_fp8(weight, norm)
