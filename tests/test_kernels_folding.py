@@ -1,6 +1,7 @@
 """Products that add the residual stream, do the LayerNorm of their input, or add their parts up inside a cluster."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
