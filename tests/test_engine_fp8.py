@@ -16,9 +16,10 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
 from turbopi.engine import forward
 from turbopi.engine import weights as engine_weights
-from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Images, StaticCall
 from turbopi.engine.emulate import RoundedWeights, rounded
-from turbopi.engine.graph_cache import Loop, RecentLoops
+from turbopi.engine.graph_cache import GraphCache
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, Loop
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.denoise.packing import PackedExpert
@@ -59,7 +60,7 @@ def engine_actions(
     shape = shape_of(observation, noise, STEPS)
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, torch.float32)
     table = modulation(model.config, weights.conditioning, STEPS)
-    pictures = Pictures(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
+    pictures = Images(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
     call = StaticCall(model.config, weights, PLAIN, shape, pictures, cache, table)
     return answer(call, observation, noise), len(made)
 
@@ -226,7 +227,7 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
     backend._put_expert_away()
     assert moved == [CPU]
-    backend._refused[Loop(10, 60), 968] = "too many"
+    backend._refused[EulerLoop(10, 60), 968] = "too many"
     backend._put_expert_away()
     assert moved == [CPU]
 
@@ -242,7 +243,7 @@ def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
     assert backend._batch_weights() is backend._weights
     backend._put_expert_away()
     assert moved == [CPU], "it is asked for, and then not let go"
-    assert backend._batch_denoises_by(Loop(2, 5, "tokens", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
+    assert backend._batch_denoises_by(ConditionedLoop(2, 5, (1.0, 0.5, 0.0)), 4, 64) is backend._weights
 
     backend = FusedBackend.__new__(FusedBackend)
     moved = []
@@ -271,7 +272,7 @@ def test_batches_guided_by_the_jacobian_keep_the_experts_first_copy_beside_fp8()
     backend._weights, backend._refused = pack(backend.config, state), {}
     backend._plan = cast(Any, SimpleNamespace(expert="fp8", scales={}))
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
-    assert backend._batch_denoises_by(Loop(2, 5, "jacobian", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
+    assert backend._batch_denoises_by(ConditionedLoop(2, 5, (1.0, 0.5, 0.0), True), 4, 64) is backend._weights
     assert moved == [CPU] and not backend._batches_denoise_in_bf16
     backend._put_expert_away()
     assert moved == [CPU], "it is asked for, and then not let go"
@@ -290,11 +291,10 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend._weights = pack(backend.config, state, backend._quantized)
     *before, last = (layer.qkv for layer in backend._weights.vlm)
     assert {matrix.numbers for matrix in before} == {torch.int8} and isinstance(last, Tensor)  # type: ignore[union-attr]
-    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = {}, PLAIN, {}, {}, {}
+    backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = PLAIN, {}, {}, {}
     backend._keepers = {}
     backend._packed_expert = None
-    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
-    backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
+    backend._graphs = GraphCache(backend._forget)
     told = backend.describe()["int8"]["plan"]
     assert told["expert"] == told["expert.down"] == told["prefix.out"] == "int8" and "expert of batches" not in told
     assert told["prefix.qkv"]["int8"] == "layers 0, 1" and "bf16: INT8 has no NaN" in " ".join(told["prefix.qkv"])
@@ -311,13 +311,12 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
-    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._keepers = {}, PLAIN, {}, {}, {}
-    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
-    backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
+    backend._ops, backend._denoisers, backend._pair_denoisers, backend._keepers = PLAIN, {}, {}, {}
+    backend._graphs = GraphCache(backend._forget)
     backend._refused = {
-        (Loop(5, 60), 968): "too many",
-        (Loop(10, 60), 968): "too many",
-        (Loop(10, 60), 1224): "too many",
+        (EulerLoop(5, 60), 968): "too many",
+        (EulerLoop(10, 60), 968): "too many",
+        (EulerLoop(10, 60), 1224): "too many",
     }
     told = backend.describe()
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
@@ -326,7 +325,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]
     backend._denoisers = {
-        (Loop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None))
+        (EulerLoop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None))
     }
     assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
     clock[0] = 1795.4
@@ -350,9 +349,9 @@ def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyP
         raise BackendUnavailable("it holds 3 clusters")
 
     monkeypatch.setattr(backend, "_denoising_kernel", refuse)
-    assert all(backend._make_denoiser(CallShape(2, slots, Loop(5, 10)), None) is None for slots in (16, 32, 48))
-    assert tried == [Loop(5, 10)]
-    assert [(key[0], why) for key, why in backend._refused.items()] == [(Loop(5, 10), "it holds 3 clusters")]
+    assert all(backend._make_denoiser(CallShape(2, slots, EulerLoop(5, 10)), None) is None for slots in (16, 32, 48))
+    assert tried == [EulerLoop(5, 10)]
+    assert [(key[0], why) for key, why in backend._refused.items()] == [(EulerLoop(5, 10), "it holds 3 clusters")]
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import ConditionedLoop, EulerLoop
 from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
@@ -196,8 +196,8 @@ def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_
 
     monkeypatch.setattr(denoise, "DenoiseKernel", make)
     kernels.refuse = "too small"
-    shapes = [CallShape(3, slots, Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))) for slots in (16, 32)]
-    assert [backend._make_keeper(shape, backend._call(shape).times.table) for shape in shapes] == [None, None]
+    shapes = [CallShape(3, slots, ConditionedLoop(2, 10, (1.0, 0.5, 0.0), True)) for slots in (16, 32)]
+    assert [backend._make_keeper(shape, backend._table(shape.loop)) for shape in shapes] == [None, None]
     assert len(tried) == 1 and backend._packed_expert is None
 
 
@@ -217,9 +217,9 @@ def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[
 
 def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
+    table = backend._table(EulerLoop(2, 10))
     for cameras in (1, 2, 3, 4):
-        assert backend._make_denoiser(CallShape(cameras, 16, Loop(2, 10)), table) is not None
+        assert backend._make_denoiser(CallShape(cameras, 16, EulerLoop(2, 10)), table) is not None
     tokens, most = backend.config.vision.num_tokens, -(-backend.config.max_prompt_tokens // 16) * 16
     assert [kernel.cache_rows for kernel in kernels.made] == [3 * tokens + most, 4 * tokens + most]
 
@@ -231,11 +231,11 @@ def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_
     actions(pi0)
     assert list(pi0.describe()["denoising"]) == ["operations, as it covers Pi0.5, this model is pi0"]
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX)), table) is not None
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX + 1)), table) is None
+    table = backend._table(EulerLoop(2, 10))
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, denoise.MAX_SUFFIX)), table) is not None
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, denoise.MAX_SUFFIX + 1)), table) is None
     monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, 9)), table) is None
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, 9)), table) is None
     told = backend.describe()["denoising"]
     assert told["one CUDA kernel"] == ["H=56, 2 steps"]
     assert told["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
@@ -287,7 +287,7 @@ class OnFakeGpu:
 
     def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
-        self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).times.table
+        self.table = self.backend._table(EulerLoop(2, 10))
         self.backend.device = GPU
         layer: Any = GemmaLayer(**{name: Placed(GPU) for name in MATRICES}, norm1=None, norm2=None)
         self.backend._weights.expert[:] = [layer] * 3
@@ -308,8 +308,8 @@ class OnFakeGpu:
     def denoise(self, steps: int, refuse: str | None = None) -> bool:
         """Whether a loop of so many steps has a kernel."""
         self.kernels.refuse = refuse
-        shape = CallShape(3, 16, Loop(steps, 10))
-        self.backend._recent.use(Loop(steps, 10))
+        shape = CallShape(3, 16, EulerLoop(steps, 10))
+        self.backend._graphs.loops.use(EulerLoop(steps, 10))
         return self.backend._make_denoiser(shape, self.table) is not None
 
 
@@ -338,9 +338,9 @@ def test_the_expert_comes_back_from_the_host_for_operations(gpu: OnFakeGpu) -> N
 
 def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgotten(gpu: OnFakeGpu) -> None:
     assert gpu.denoise(2) and not gpu.denoise(3, refuse="too small") and not gpu.denoise(4, refuse="too small")
-    gpu.backend._forget(Loop(3, 10))
+    gpu.backend._forget(EulerLoop(3, 10))
     assert gpu.places == {GPU}, "the loop of 4 steps still takes operations"
-    gpu.backend._forget(Loop(4, 10))
+    gpu.backend._forget(EulerLoop(4, 10))
     assert gpu.places == {CPU}
 
 

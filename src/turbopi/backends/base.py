@@ -49,7 +49,7 @@ class Backend(Protocol):
 
     any_horizon     whether noise may have another action horizon than the config's
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
-                    `not_warm`. Set by the policy; a backend that does nothing of the kind needn't look
+                    `cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
     """
 
     name: ClassVar[str]
@@ -153,7 +153,7 @@ class RunsBatches(Protocol):
     ) -> BegunBatch:
         """`Begins.begin` of several observations: each one's valid pictures, perhaps none.
 
-        forms  of each observation's conditioning (`engine.conditioned.batch_form`), by which they are put together;
+        forms  of each observation's conditioning (`engine.loops.batch_form`), by which they are put together;
                None: all are plain
         """
 

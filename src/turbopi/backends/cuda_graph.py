@@ -1,6 +1,6 @@
 """Backend `cuda_graph`: a call is a `Graph` for pictures and one for all the rest, with stock PyTorch.
 
-What is captured, kept and refused: engine/runner.py; of batches: engine/batches.py.
+Which graphs there are: engine/plan.py; capture and replay: engine/runner.py; of batches: engine/batch_runner.py.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from turbopi.engine import without_compiler
 from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import Loop, Table
 from turbopi.engine.weight_placement import PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, Ops
@@ -39,7 +39,7 @@ class CudaGraphBackend(BatchRunner):
         make_caches_writable()
         weights, ops = self._pack(load), self._make_ops()
         super().__init__(config, weights, ops, device, joint=ops is without_compiler.OPS)
-        self._loops: dict[tuple[int, tuple[float, ...]], without_compiler.Denoiser] = {}  # by `Loop.table`
+        self._loops: dict[Table, without_compiler.Denoiser] = {}  # by `Loop.table`
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -73,5 +73,5 @@ class CudaGraphBackend(BatchRunner):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        if loop.table not in {other.table for other in self._recent if other.form == "plain"}:
+        if loop.table not in {other.table for other in self._graphs.loops if other.form == "plain"}:
             self._loops.pop(loop.table, None)

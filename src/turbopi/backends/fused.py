@@ -21,8 +21,8 @@ from turbopi.backends.device_lost import ADVICE
 from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.graph_cache import Loop
-from turbopi.engine.runner import MAX_CAMERAS, bucket
+from turbopi.engine.loops import Loop
+from turbopi.engine.plan import MAX_CAMERAS, bucket
 from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops, PairDenoiser

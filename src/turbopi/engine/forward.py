@@ -48,17 +48,17 @@ def vision_tokens(
     out: Tensor,
     head_ends: Callable[[], None] = lambda: None,
 ) -> None:
-    """Pictures -> language-model tokens, into `out` [V * 256, D].
+    """Images -> language-model tokens, into `out` [V * 256, D].
 
-    parts      each brings some of the pictures, (uint8|float32)[pictures, 224, 224, 3], when the head of those before
-               has ended. A head is patch embedding and the first layers; the others are of all pictures together
+    parts      each brings some of the images, (uint8|float32)[images, 224, 224, 3], when the head of those before
+               has ended. A head is patch embedding and the first layers; the others are of all images together
     head_ends  is called behind each head: see `engine.graph.HEAD`
     """
     eps, several = config.vision.layer_norm_eps, len(parts) > 1
     head = weights.vision[:HEAD_LAYERS]
     rest, ends = weights.vision[len(head) :], []
     for bring in parts:
-        x = ops.embed_patches(bring(), weights.patch, weights.position, out.dtype)  # [pictures * 256, W]
+        x = ops.embed_patches(bring(), weights.patch, weights.position, out.dtype)  # [images * 256, W]
         y = None
         for layer in head:
             x, y = _vision_layer(config, ops, layer, x, y)
