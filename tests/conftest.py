@@ -19,7 +19,7 @@ from shared import (  # noqa: F401
 # Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
 QUICK = (
     *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
-    *("test_launch_geometry", "test_recent_loops", "test_tools_mutate"),
+    *("test_graph_cache", "test_launch_geometry", "test_tools_mutate"),
 )
 
 

@@ -18,7 +18,7 @@ from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
 from turbopi.engine.loops import Loop, Table
-from turbopi.engine.weight_placement import PackingRoom, is_conditioning
+from turbopi.engine.weight_placement import WeightPlacement, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.support.errors import BackendError
@@ -51,8 +51,8 @@ class CudaGraphBackend(BatchRunner):
         return None
 
     def _pack(self, load: LoadState) -> Weights:
-        room = PackingRoom(self.config, self.device, partial(is_conditioning, self.config))
-        return pack(self.config, load(room, "f32" if self.precision == "f32" else "bf16"))
+        placement = WeightPlacement(self.config, self.device, partial(is_conditioning, self.config))
+        return pack(self.config, load(placement, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
         if PyTorchCompileBackend.unavailable(self.device) is not None:

@@ -23,7 +23,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.loops import Loop
 from turbopi.engine.plan import MAX_CAMERAS, bucket
-from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
+from turbopi.engine.weight_placement import HOST, WeightPlacement, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
@@ -161,8 +161,8 @@ class FusedBackend(CudaGraphBackend):
             """
             return self._plan is not None or name.startswith("expert.layers.") or is_conditioning(self.config, name)
 
-        room = PackingRoom(self.config, self.device, on_host)
-        return pack(self.config, load(room, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        placement = WeightPlacement(self.config, self.device, on_host)
+        return pack(self.config, load(placement, "bf16"), self._quantized, device=self.device, expert_device=HOST)
 
     @property
     def _directions(self) -> Mapping[str, Directions]:

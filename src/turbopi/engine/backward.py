@@ -1,8 +1,7 @@
 """The vector-Jacobian product through the action expert, the prefix's keys and values fixed: exact, as operations.
 
-Forward as `forward.expert_output`, but each layer saves what backward needs, for one evaluation; then back, layer by
-layer. The suffix's own keys and values depend on its tokens, so gradients go through the
-cache's last rows, too.
+Forward as `forward.expert_output`, but each layer saves what backward needs, for one evaluation; then backward, layer
+by layer. The suffix's own keys and values depend on its tokens, so gradients go through the cache's last rows, too.
 
 Shapes: T suffix tokens, D width, K head_dim, n query heads, R cache rows.
 """
@@ -27,7 +26,7 @@ class SavedLayer:
     """What backward through one layer needs."""
 
     x: Tensor  # [T, D]  the residual stream as attention's norm reads it
-    attention: Any  # as `BackwardOps.attention` keeps it
+    attention: Any  # as `BackwardOps.attention` saves it
     middle: Tensor  # [T, D]  the residual stream as the MLP's norm reads it
     gate_up: Tensor  # [T, 2F]
 
@@ -50,7 +49,7 @@ class Expert:
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[SavedLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer saves, the last stream)."""
-        config, ops, back, g, kept = self.config, self.ops, self.back, self.config.expert, []
+        config, ops, back, g, saved = self.config, self.ops, self.back, self.config.expert, []
         slots, heads = self._slots(tokens), self._heads(tokens)
         hidden_keys = {} if self.hidden is None else {"hidden": self.hidden}
         x: Tensor = tokens
@@ -68,19 +67,19 @@ class Expert:
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
             gate_up, hidden = back.gate_up(normed, layer.gate_up)
             y, gate = back.down(hidden, layer.down), next_gate
-            kept.append(SavedLayer(start, for_vjp, x, gate_up))
+            saved.append(SavedLayer(start, for_vjp, x, gate_up))
         scale, shift, _ = norm_weights(self.table, 2 * g.depth, self.weights.expert_norm)
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
-        return normed.float(), kept, x
+        return normed.float(), saved, x
 
-    def kept(self, step: KeptStep) -> tuple[list[SavedLayer], Tensor]:
+    def saved(self, step: KeptStep) -> tuple[list[SavedLayer], Tensor]:
         """What `forward` saves of each layer and the last stream, where a denoiser went forward."""
         *streams, last = step.stream
         attended = self.back.kept_attention(step.q, self.cache_k, self.cache_v, *self._heads(last))
         layers = zip(streams[::2], attended, streams[1::2], step.gate_up, strict=True)
         return [SavedLayer(*layer) for layer in layers], last
 
-    def vjp(self, kept: list[SavedLayer], last: Tensor, d_out: Tensor) -> Tensor:
+    def vjp(self, saved: list[SavedLayer], last: Tensor, d_out: Tensor) -> Tensor:
         """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
         back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
         heads = self._heads(last)
@@ -97,7 +96,7 @@ class Expert:
 
         d_x, d_y = norm(d_out.to(last.dtype), last, 2 * g.depth, self.weights.expert_norm, None)
         for i in reversed(range(g.depth)):
-            layer, had = layers[i], kept[i]
+            layer, had = layers[i], saved[i]
             d_normed = back.gate_up_vjp(back.down_vjp(d_y, layer.down, had.gate_up), layer.gate_up)
             d_x, d_y = norm(d_normed, had.middle, 2 * i + 1, layer.norm2, d_x)
             d_attended = back.out_vjp(d_y, layer.out)
@@ -132,7 +131,7 @@ def jacobian_velocity(
     def of_actions(rows: Tensor) -> Tensor:
         return rows.view(*x_t.shape[:-2], -1, rows.shape[-1])[..., -horizon:, :]
 
-    out, kept, last = expert.forward(tokens)
+    out, saved, last = expert.forward(tokens)
     v_t = project(small, "action_out_proj", of_actions(out))
     error = conditioned.error(step, x_t, v_t) * conditioned.weights
     d_out = (conditioned.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"]
@@ -141,7 +140,7 @@ def jacobian_velocity(
     else:  # Pi0's state token has no velocity
         of_actions(every := torch.zeros_like(out)).copy_(d_out)
         d_out = every
-    d_tokens = of_actions(expert.vjp(kept, last, d_out))
+    d_tokens = of_actions(expert.vjp(saved, last, d_out))
     through = suffix_vjp(expert.config, small, x_t, time, d_tokens)
     return v_t - conditioned.tokens.gain[step, ..., None] * (error - through)
 
@@ -165,10 +164,10 @@ def jacobian_step(
         conditioned.tokens,
         expert.back,
     )
-    kept, last = expert.kept(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
+    saved, last = expert.saved(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
     out, into = small["action_out_proj.weight"], small["action_in_proj.weight"]
     error, d_out = back.pull(x_t, v_t, tokens.times[step], tokens.target, conditioned.weights, out, last.dtype)
-    d_tokens = expert.vjp(kept, last, d_out)
+    d_tokens = expert.vjp(saved, last, d_out)
     back.move(d_tokens, into, x_t, v_t, error, tokens.gain[step], tokens.steps[step], next_x)
 
 

@@ -1,4 +1,4 @@
-"""One call for several observations: their images, prefixes and action chunks as rows of the same products.
+"""One call for several observations: their images, prefixes and action chunks as rows of the same matmuls.
 
 A batched call is three graphs, one after the other: vision of so many images (`call.Images`), `PackedPrefix` of so
 many rows, and `BatchLoop`, all denoising steps of so many observations. Observations of other cameras, prompts and

@@ -81,7 +81,7 @@ class BatchRunner(GraphRunner):
 
     # of `cuda_graph`, measured on an H200, two cameras, bfloat16: without the denoising kernel sharing pays sooner
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.25, 4: 1.85, 8: 3.1, 16: 5.6}
-    # of guided ones, measured with `fused`'s operations, but for 2. Larger ones would keep gigabytes for the way back
+    # of guided ones, measured with `fused`'s operations, but for 2. Larger ones would save gigabytes for backward
     JACOBIAN_COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.5, 4: 2.2, 8: 3.5}
 
     def __init__(
@@ -101,8 +101,6 @@ class BatchRunner(GraphRunner):
     def jacobian_costs(self) -> Mapping[int, float]:
         """As `batch_costs`, of observations guided by the true Jacobian, in single calls of that kind."""
         return self.JACOBIAN_COSTS
-
-    # -- warm up, capture ----------------------------------------------------------------------------------------------
 
     def warmup_batches(
         self,
@@ -157,8 +155,6 @@ class BatchRunner(GraphRunner):
         """
         return self._weights
 
-    # -- replay --------------------------------------------------------------------------------------------------------
-
     def begin_batch(
         self,
         images: Sequence[Sequence[np.ndarray]],
@@ -206,7 +202,8 @@ class BatchRunner(GraphRunner):
                 self._check_tokens(count, len(prompt))
             with self._explaining():
                 slots = plan.batch_slots(batch, [len(prompt) for prompt in tokens])
-                prefix, denoise = self._graph(GraphKey("prefix", *sizes, slots)), self._graph(_denoise(sizes, loop))
+                prefix = self._graph(GraphKey("prefix", *sizes, slots))
+                denoise = self._graph(GraphKey("denoise", *sizes, loop=loop))
                 prefix.buffers.write(cameras, tokens)
                 denoise.buffers.write(noise, state, conditionings)
                 prefix.graph.launch()
@@ -248,8 +245,6 @@ class BatchRunner(GraphRunner):
         state = np.stack([row.state for row in rows])
         return begun.finish([row.tokens for row in rows], state, noise.cpu().numpy(), num_steps, conditionings)
 
-    # -- how a batch is put together, and what is reported -------------------------------------------------------------
-
     def _costs_of(self, form: Form) -> Mapping[int, float]:
         """As `batch_costs`, in single calls of this form, which may run together."""
         if form == "plain":
@@ -286,13 +281,10 @@ class BatchRunner(GraphRunner):
         self.sample(observation, noise, num_steps, conditioning=given)
         images = plan.batch_images(count, observation.image_mask.sum(1).tolist())
         sizes = (count, images, observation.images.dtype == torch.float32)
-        run = self._graph(_denoise(sizes, loop_of_batch(given, num_steps, noise.shape[1], self.config))).buffers
+        loop = loop_of_batch(given, num_steps, noise.shape[1], self.config)
+        run = self._graph(GraphKey("denoise", *sizes, loop=loop)).buffers
         traces = [padded_trace(*run.trace(row), self._valid(observation, row)) for row in range(count)]
         return {name: torch.cat([one[name] for one in traces], dim=int(name != "actions")) for name in traces[0]}
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"batches": plan.batches(list(self._graphs.entries))}
-
-
-def _denoise(sizes: tuple[int, int, bool], loop: Loop) -> GraphKey:
-    return GraphKey("denoise", *sizes, loop=loop)

@@ -57,7 +57,7 @@ class CallShape:
     def cache_rows(self, config: ModelConfig) -> int:
         """Keys of the suffix's attention: the prefix's slots, rows that nothing sees, the suffix's.
 
-        A multiple of 16, since the library's products take 16 bytes at a time or a kernel half as fast.
+        A multiple of 16, since the library's matmuls take 16 bytes at a time or a kernel half as fast.
         """
         return -(-(self.prefix_slots(config) + self.suffix_tokens(config)) // 16) * 16
 
@@ -149,7 +149,7 @@ class Images:
     Args:
         cameras: how many images; with none of them the stage is empty.
         float_images: as `CallShape`'s.
-        prompt_slots: the most of any call: `embs` has the cameras' tokens, then room for the prompt's.
+        prompt_slots: the most of any call: `embs` has the cameras' tokens, then space for the prompt's.
         embs: these rows, if they are shared with other calls; None: its own.
     """
 
@@ -200,7 +200,7 @@ class Images:
         """`upload` in steps, one for each head of `run` or, `resized`, `run_resized`, to be done before it: see
         `Graph.launch`.
         """
-        assert len(images) <= self.cameras, f"{len(images)} images, there is room for {self.cameras}"
+        assert len(images) <= self.cameras, f"{len(images)} images, there is space for {self.cameras}"
 
         def upload(part: Part, place: slice) -> None:
             these = images[place]

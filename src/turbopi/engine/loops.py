@@ -11,6 +11,7 @@ Graphs, tables and kernels are made for a loop. Loops of a call and of a batch a
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -60,11 +61,8 @@ class Loop:
 
 @dataclass(frozen=True)
 class EulerLoop(Loop):
+    form: ClassVar[Form] = "plain"
     time: float | None = None  # where the one step of a solver's evaluation begins; None: the steps are openpi's
-
-    @property
-    def form(self) -> Form:
-        return "plain"
 
     @property
     def table(self) -> Table:
@@ -94,29 +92,18 @@ class ConditionedLoop(Loop):
 
 @dataclass(frozen=True)
 class SolverLoop(Loop):
+    form: ClassVar[Form] = "solver"
     integration: Integration
-
-    @property
-    def form(self) -> Form:
-        return "solver"
 
     @property
     def table(self) -> Table:
         return self.integration.evaluated
 
     @property
-    def by_token(self) -> ConditionedLoop:
-        """One evaluation, at any of this loop's times."""
-        return ConditionedLoop(1, self.horizon, self.integration.evaluated)
-
-    @property
-    def one_by_one(self) -> tuple[EulerLoop, ...]:
-        """Each evaluation."""
-        return tuple(EulerLoop(1, self.horizon, t) for t in self.integration.evaluated)
-
-    @property
     def evaluations(self) -> tuple[Loop, ...]:
-        return (self.by_token, *dict.fromkeys(self.one_by_one))
+        """One for any of the times, where a launch takes times by token; then one for each evaluation."""
+        times = self.integration.evaluated
+        return ConditionedLoop(1, self.horizon, times), *(EulerLoop(1, self.horizon, t) for t in times)
 
     def __str__(self) -> str:
         return f"{super().__str__()}, {self.integration}"

@@ -14,7 +14,7 @@ from turbopi.config import ImageResize
 from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
 from turbopi.preprocess.images import RESIZES, copy_picture, placement
 
-MOST_SIZES = 16  # of images whose weights are kept
+MOST_SIZES = 16  # of images whose weights are cached
 
 
 class Resizer:
@@ -30,7 +30,7 @@ class Resizer:
         self._taps: OrderedDict[tuple[int, int, bool], tuple[Taps, Taps, int, int]] = OrderedDict()  # see `_place`
 
     def upload(self, images: Sequence[np.ndarray | None], resize: ImageResize) -> None:
-        """Send images uint8[h, w, 3], without waiting; None: what `images` holds is kept. All may change afterwards.
+        """Send images uint8[h, w, 3], without waiting; None: `images` stays as it is. All may change afterwards.
 
         Raises ObservationError for a image that is too narrow.
         """
@@ -62,7 +62,7 @@ class Resizer:
         return host[:size], device[:size]
 
     def _place(self, height: int, width: int) -> tuple[Taps, Taps, int, int]:
-        """Taps of rows and columns, and where the image begins. Those used last are kept, at least a call's own."""
+        """Taps of rows and columns, and where the image begins. Those used last are cached, at least a call's own."""
         key = (height, width, self._images.dtype == torch.uint8)
         if key not in self._taps:
             rows, columns = placement((height, width, 3), tuple(self._images.shape[1:]))

@@ -62,13 +62,14 @@ def solving(
     loop = shape.loop
     launches: list[tuple[Denoiser, tuple[TokenInputs, ...]]] = []
     assert isinstance(loop, SolverLoop), loop
+    at_any_time, *one_by_one = loop.evaluations
     if by_token:
-        kernel = make(replace(shape, loop=loop.by_token), table)
+        kernel = make(replace(shape, loop=at_any_time), table)
         if kernel is None:
             return None
         launches = [(kernel, (_token_inputs(loop, k, config, device),)) for k in range(loop.steps)]
     else:
-        for k, one in enumerate(loop.one_by_one):
+        for k, one in enumerate(one_by_one):
             kernel = make(replace(shape, loop=one), None if table is None else table[k : k + 1])
             if kernel is None:
                 return None

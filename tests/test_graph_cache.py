@@ -1,10 +1,11 @@
-"""What is kept for numbers of steps and horizons is bounded, and what is let go is let go whole."""
+"""The plan of graphs and their cache: complete, bounded, an entry only when its capture has succeeded, freed whole."""
 
 import weakref
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
 from conftest import golden_cases, golden_model
@@ -20,14 +21,45 @@ from turbopi.backends.tensorrt.pipelined import TensorRTPipelinedBackend
 from turbopi.engine.batch import SharedRows
 from turbopi.engine.call import CallShape
 from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, Captured, GraphCache, LoopCache, fit
-from turbopi.engine.loops import EulerLoop, Loop, SolverLoop
-from turbopi.engine.plan import GraphKey
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, Loop, SolverLoop
+from turbopi.engine.plan import BUCKET, GraphKey, batch_slots, bucket, warm_graphs
 from turbopi.engine.runner import HostRow
 from turbopi.engine.without_compiler import OPS
 from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import BackendUnavailable, ObservationError
 
 STEPS = range(1, 41)
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+def test_warm_up_captures_every_graph_that_calls_of_any_prompt_need(batch: int) -> None:
+    loop, most, sizes = EulerLoop(10, 50), 200, (batch, 2 * batch, False)
+    warm = list(warm_graphs(*sizes, loop, most, resizes=True))
+    needed = {GraphKey("vision", *sizes), GraphKey("resized", *sizes)}
+    for tokens in range(1, most + 1):
+        slots = batch_slots(batch, [tokens] * batch)
+        assert slots % BUCKET == 0 and batch * tokens <= slots < batch * (tokens + BUCKET)
+        if batch == 1:
+            assert slots == bucket(tokens)
+            needed.add(GraphKey("answer", *sizes, slots, loop))
+        else:
+            needed |= {GraphKey("prefix", *sizes, slots), GraphKey("denoise", *sizes, loop=loop)}
+    assert needed == set(warm) and len(needed) == len(warm), "and no other, and none twice"
+    assert "resized" not in {key.part for key in warm_graphs(*sizes, loop, most, resizes=False)}
+
+
+def test_a_row_of_a_loops_table_has_a_time_and_loops_of_two_kinds_are_never_one() -> None:
+    integration = Integration("heun", (1.0, 0.5, 0.0))
+    solver = SolverLoop(3, 7, integration)
+    loops: list[Loop] = [EulerLoop(3, 7), EulerLoop(1, 7, 0.5), solver, *solver.evaluations]
+    loops += [ConditionedLoop(3, 7, (1.0, 0.5, 0.0)), ConditionedLoop(3, 7, (1.0, 0.5, 0.0), True)]
+    for loop in loops:
+        times = loop.table_times("accumulated")
+        assert len(times) == loop.rows and times.dtype == np.float32
+    assert solver.table_times("accumulated").tolist() == list(integration.evaluated) == [1.0, 0.5, 0.5]
+    assert [loop.table for loop in solver.evaluations] == [(1.0, 0.5, 0.5), (1.0,), (0.5,), (0.5,)]
+    assert {loop.form for loop in loops} == {"plain", "solver", "tokens", "jacobian"}
+    assert len({*loops, *(str(loop) for loop in loops)}) == 2 * len({*loops})
 
 
 def test_the_least_recently_used_loop_goes() -> None:
