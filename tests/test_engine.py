@@ -46,8 +46,14 @@ def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32",
     return call
 
 
+def send(images: Images, given: list[np.ndarray]) -> None:
+    """All of a call's, at once."""
+    for upload in images.uploads(given, None, False):
+        upload()
+
+
 def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
-    call.images.upload(list(observation.images[row][observation.image_mask[row]].numpy()))
+    send(call.images, list(observation.images[row][observation.image_mask[row]].numpy()))
     call.write_inputs(
         noise[row].numpy(),
         observation.state[row].numpy(),
@@ -177,7 +183,7 @@ def test_every_valid_picture_must_be_given() -> None:
     observation, noise = made_up("pi05", 2, 5)
     call = static_call("pi05", shape_of(observation, noise, 1))
     with pytest.raises(ValueError, match="shorter"):
-        call.images.upload(list(observation.images[0, :1].numpy()))
+        send(call.images, list(observation.images[0, :1].numpy()))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

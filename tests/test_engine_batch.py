@@ -9,6 +9,7 @@ from conftest import golden_cases, golden_model
 from hypothesis import given
 from hypothesis import strategies as st
 from test_begin import OnCpu, on_cpu
+from test_engine import send
 from torch import Tensor
 
 from turbopi.config import Kind
@@ -123,7 +124,7 @@ def batched(
     table = modulation(model.config, weights.conditioning, steps)
     loop = BatchLoop(buffers, EulerLoop(steps, noise.shape[1]), by or weights, table)
     loop.write(noise.numpy(), observation.state.numpy())
-    pictures.upload(shown)
+    send(pictures, shown)
     pictures.run()
     prefix.run()
     loop.run()

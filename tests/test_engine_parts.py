@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_begin import OnCpu, on_cpu
 from test_capture import DONE, FakeCuda, capture
+from test_engine import send
 from test_engine_batch import observations
 from test_resize import Resizing, picture
 from torch import Tensor
@@ -106,7 +107,7 @@ class TestAdded:
             found = []
             for ops in (PLAIN, adding(every)):
                 pictures = Images(golden_model("pi05").config, packed(), ops, 5, False, 0)
-                pictures.upload(shown)
+                send(pictures, shown)
                 pictures.run()
                 found.append(pictures.embs)
             assert bool(found[0].isfinite().all()) and torch.equal(*found)
@@ -202,7 +203,7 @@ class TestPictures:
             pictures = Images(golden_model("pi05").config, weights, PLAIN, count, dtype == torch.float32, 0)
             uploads = pictures.uploads(shown, None, False)
             assert len(uploads) == heads
-            pictures.upload(shown)
+            send(pictures, shown)
             pictures.run()
             found.append(pictures.embs)
         assert bool(found[0].isfinite().all()) and torch.equal(*found)

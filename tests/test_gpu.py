@@ -11,7 +11,7 @@ import pytest
 import torch
 from conditioned import BY_TOKEN, conditioned
 from conftest import GOLDEN, golden_cases, golden_folder, golden_model
-from test_engine import made_up
+from test_engine import made_up, send
 
 from turbopi import backends
 from turbopi.config import ImageResize, Kind
@@ -188,7 +188,7 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
                 patched.setattr(forward, "HEAD_LAYERS", None)
                 whole[call] = Graph(call.run, runner._pool, runner._stream)
             assert len(whole[call]._parts) == 1
-        call.images.upload(row.images)
+        send(call.images, row.images)
         call.write_inputs(noise[0].numpy(), row.state, row.tokens)
         whole[call].replay()
         return call.actions.clone()

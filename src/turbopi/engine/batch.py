@@ -173,14 +173,14 @@ class BatchLoop:
         | PairDenoiser,  # operations with these, perhaps others than those of `buffers`; or, of two, a kernel
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation; a conditioned loop's: [U, …]
     ) -> None:
-        conditioned = isinstance(loop, ConditionedLoop)
-        assert not conditioned or isinstance(by, Weights), loop
+        by_token = loop if isinstance(loop, ConditionedLoop) else None
+        assert by_token is None or isinstance(by, Weights), loop
         self._buffers, self._by = buffers, by
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
         self._tokens = loop.horizon + (config.kind == "pi0")
-        self._conditioned = Conditioned.allocate(config, loop, device, batch) if conditioned else None
+        self._conditioned = None if by_token is None else Conditioned.allocate(config, by_token, device, batch)
         self._times = StepTimes.of(config, loop, table, self._conditioned, device)
         chunk = (batch, loop.horizon, config.action_dim)
         fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
@@ -304,7 +304,7 @@ class BatchLoop:
         return tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
 
     def _whole_cache(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Keys and values of all prefixes with room for the suffixes' behind them, and what is hidden from `Expert`.
+        """Keys and values of all prefixes with space for the suffixes' behind them, and what is hidden from `Expert`.
 
         One matmul over the rows of all observations, most of them hidden: backward has no attention of its own.
         Rows that nothing was written to are 0, as 0 * NaN is NaN.

@@ -184,21 +184,14 @@ class Images:
             return False
         return not all(self._parts[0].fits(one) for one in images)
 
-    def upload(self, images: Sequence[np.ndarray], resize: ImageResize | None = None) -> None:
-        """Valid images, in place of those of the call before, to where `run` or `run_resized` takes them from.
-
-        Each is as `images`, or uint8[h, w, 3]: then the device resizes it, or the host if the device can't. Nothing is
-        waited for. A image that is wrong raises; those before it may have been sent, and the next call's take the
-        place of them all.
-        """
-        for upload in self.uploads(images, resize, self.resizes(images, resize)):
-            upload()
-
     def uploads(
         self, images: Sequence[np.ndarray], resize: ImageResize | None, resized: bool
     ) -> list[Callable[[], None]]:
-        """`upload` in steps, one for each head of `run` or, `resized`, `run_resized`, to be done before it: see
-        `Graph.launch`.
+        """What sends valid images to where `run` or, `resized`, `run_resized` takes them from, without waiting.
+
+        One for each head of the run, to be done before it: see `Graph.launch`. An image is as `images`, or
+        uint8[h, w, 3]: then the device resizes it, or the host if the device can't. A wrong one raises; those before it
+        may have been sent, and the next call's take the place of them all.
         """
         assert len(images) <= self.cameras, f"{len(images)} images, there is space for {self.cameras}"
 

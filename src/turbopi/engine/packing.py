@@ -18,7 +18,7 @@ TILE = 64  # query rows of a tile of packed attention; rows of all heads of a to
 class Packed:
     """Where rows come from and which of them see each other, as `engine.batch` sends it to the device."""
 
-    source: np.ndarray  # int64[R]  a image's token, or -1 - id of a prompt's
+    source: np.ndarray  # int64[R]  an image's token, or -1 - id of a prompt's
     positions: np.ndarray  # int64[R]  in its own observation
     segments: np.ndarray  # int32[2, B + 1]  first row and number of rows of each observation; the last one is padding
     tiles: np.ndarray  # int32[most_tiles, 4]  see `kernels.interface.Segments`

@@ -32,7 +32,7 @@ class Resizer:
     def upload(self, images: Sequence[np.ndarray | None], resize: ImageResize) -> None:
         """Send images uint8[h, w, 3], without waiting; None: `images` stays as it is. All may change afterwards.
 
-        Raises ObservationError for a image that is too narrow.
+        Raises ObservationError for an image that is too narrow.
         """
         rows = np.zeros_like(self._rows)
         for camera, image in enumerate(images):
