@@ -140,10 +140,15 @@ def cold_graph(name: str, key: GraphKey, captured: Iterable[GraphKey]) -> Observ
 
 def singles(captured: Iterable[GraphKey]) -> list[str]:
     """The calls of one observation that are captured, in words."""
-    keys = [(key, key.loop) for key in captured if key.batch == 1 and key.loop is not None]
-    return [text for *_, text in sorted({(*key[2:5:2], loop.steps, loop.horizon, str(key)) for key, loop in keys})]
+    return _in_words(key for key in captured if key.batch == 1)
 
 
 def batches(captured: Iterable[GraphKey]) -> list[str]:
     """The batched calls that are captured, in words."""
-    return [str(one) for one in sorted(captured, key=str) if one.batch > 1 and one.loop is not None]
+    return _in_words(key for key in captured if key.batch > 1)
+
+
+def _in_words(keys: Iterable[GraphKey]) -> list[str]:
+    loops = [(key, key.loop) for key in keys if key.loop is not None]
+    known = {(key.batch, key.images, key.slots, one.steps, one.horizon, str(key)) for key, one in loops}
+    return [text for *_, text in sorted(known)]
