@@ -208,10 +208,9 @@ def test_calls_share_the_pictures_of_as_many_cameras() -> None:
     for tokens in (5, 20, 40):
         observation, noise = made_up("pi05", 2, tokens)
         backend.sample(observation, noise, 1)
-    calls = list(backend._calls.values())
-    assert len(calls) == 3
-    assert len({call.embs.data_ptr() for call in calls}) == 1
-    assert len(backend._pictures) == 1
+    buffers = [one.buffers for one in backend._graphs.entries.values()]
+    assert len(buffers) == 1 + 3, "vision, and a call for each bucket"
+    assert len({one.embs.data_ptr() for one in buffers}) == 1
 
 
 def test_one_observation_at_a_time() -> None:
@@ -273,7 +272,7 @@ def test_a_backend_may_explain_why_the_gpu_failed_in_either_part(part: str) -> N
         if name == part:
             raise RuntimeError("CUDA error: unspecified launch failure")
 
-    for graph in backend._graphs.values():
+    for graph, _ in backend._graphs.entries.values():
         graph._tell = fail  # type: ignore[attr-defined]
     with pytest.raises(BackendError, match="a kernel trapped"):
         backend.sample(observation, noise, 1)

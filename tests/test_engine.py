@@ -14,9 +14,9 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.config import Kind
-from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Images, StaticCall
 from turbopi.engine.compiled import compiled
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import EulerLoop
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
@@ -36,8 +36,8 @@ def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32",
     cache = Cache.allocate(
         model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype, ops is OPS
     )
-    pictures = Pictures(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
-    table = modulation(model.config, weights.conditioning, shape.num_steps)
+    pictures = Images(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
+    table = modulation(model.config, weights.conditioning, shape.loop.steps)
     call = StaticCall(model.config, weights, ops, shape, pictures, cache, table)
     if ops is OPS and table is not None:
         call.denoiser = dataclasses.replace(
@@ -46,8 +46,14 @@ def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32",
     return call
 
 
+def send(images: Images, given: list[np.ndarray]) -> None:
+    """All of a call's, at once."""
+    for upload in images.uploads(given, None, False):
+        upload()
+
+
 def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
-    call.pictures.upload(list(observation.images[row][observation.image_mask[row]].numpy()))
+    send(call.images, list(observation.images[row][observation.image_mask[row]].numpy()))
     call.write_inputs(
         noise[row].numpy(),
         observation.state[row].numpy(),
@@ -61,7 +67,7 @@ def shape_of(observation: Observation, noise: Tensor, steps: int, row: int = 0) 
     tokens = int(observation.token_mask[row].sum())
     slots = max(16, -(-tokens // 16) * 16)
     floats = observation.images.dtype == torch.float32
-    return CallShape(int(observation.image_mask[row].sum()), slots, Loop(steps, noise.shape[1]), floats)
+    return CallShape(int(observation.image_mask[row].sum()), slots, EulerLoop(steps, noise.shape[1]), floats)
 
 
 def made_up(kind: Kind, cameras: int, tokens: int, seed: int = 0) -> tuple[Observation, Tensor]:
@@ -177,7 +183,7 @@ def test_every_valid_picture_must_be_given() -> None:
     observation, noise = made_up("pi05", 2, 5)
     call = static_call("pi05", shape_of(observation, noise, 1))
     with pytest.raises(ValueError, match="shorter"):
-        call.pictures.upload(list(observation.images[0, :1].numpy()))
+        send(call.images, list(observation.images[0, :1].numpy()))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

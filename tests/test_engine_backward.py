@@ -16,7 +16,7 @@ from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, su
 from turbopi.engine.compiled import compiled
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import expert_output, project, rope_of_all_positions
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import ConditionedLoop
 from turbopi.engine.weights import pack
 from turbopi.kernels.backward import PLAIN as PIECES
 from turbopi.kernels.backward import PLAIN_BACKWARD, rope_vjp
@@ -237,7 +237,7 @@ def test_what_a_denoiser_keeps_serves_as_what_the_operations_keep(times: Times, 
     problem = Problem.of("pi05", times)
     ops, back = few_tokens() if kernels else (PLAIN, PLAIN_BACKWARD)
     x_t, horizon, config = problem.chunk(0), problem.horizon, problem.model.config
-    asked = Conditioned.allocate(config, Loop(1, horizon, "jacobian", (1.0, 0.0)), torch.device("cpu"))
+    asked = Conditioned.allocate(config, ConditionedLoop(1, horizon, (1.0, 0.0), True), torch.device("cpu"))
     asked.tokens.times.fill_(0.6), asked.tokens.gain.fill_(0.7)
     asked.tokens.target.copy_(problem.chunk(1)), asked.weights.copy_(torch.linspace(1, 0, horizon)[:, None])
     asked.tokens.steps.copy_(-torch.linspace(0, 1, horizon))

@@ -9,13 +9,16 @@ from conftest import golden_cases, golden_model
 from hypothesis import given
 from hypothesis import strategies as st
 from test_begin import OnCpu, on_cpu
+from test_engine import send
 from torch import Tensor
 
 from turbopi.config import Kind
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
-from turbopi.engine.call import Pictures
-from turbopi.engine.graph_cache import MOST_LOOPS, Loop
-from turbopi.engine.packing import TILE, most_tiles, pack_rows, split
+from turbopi.engine.call import Images
+from turbopi.engine.graph_cache import MOST_LOOPS
+from turbopi.engine.loops import EulerLoop
+from turbopi.engine.packing import TILE, most_tiles, pack_rows
+from turbopi.engine.plan import split
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.kernels.interface import PairDenoiser
@@ -55,17 +58,17 @@ def test_a_call_that_is_slower_than_its_observations_apart_is_never_made() -> No
     heads=st.sampled_from([1, 4, 8]),
 )
 def test_packed_rows(observations: list[tuple[int, int]], spare: int, empty: int, heads: int) -> None:
-    per_picture, batch = 4, len(observations) + empty
+    per_image, batch = 4, len(observations) + empty
     prompts = [np.arange(1, tokens + 1) + 100 * i for i, (_, tokens) in enumerate(observations)]
-    rows = sum(count * per_picture + tokens for count, tokens in observations) + spare
+    rows = sum(count * per_image + tokens for count, tokens in observations) + spare
     counts = [count for count, _ in observations]
-    packed = pack_rows(counts, prompts, batch=batch, rows=rows, per_picture=per_picture, heads=heads)
+    packed = pack_rows(counts, prompts, batch=batch, rows=rows, per_image=per_image, heads=heads)
     starts, lengths = packed.segments
     assert lengths.sum() == rows and (lengths[len(observations) : batch] == 0).all() and lengths[batch] == spare
     assert (starts[1:] == starts[:-1] + lengths[:-1]).all()
     seen = 0
     for start, length, count, prompt in zip(starts, lengths, counts, prompts, strict=False):
-        own, pictures = packed.source[start : start + length], count * per_picture
+        own, pictures = packed.source[start : start + length], count * per_image
         assert (own[:pictures] == np.arange(seen, seen + pictures)).all() and (-1 - own[pictures:] == prompt).all()
         assert (packed.positions[start : start + length] == np.arange(length)).all()
         seen += pictures
@@ -113,15 +116,15 @@ def batched(
     weights = pack(model.config, dict(model.state_dict()))
     rows = [HostRow.of(observation, row) for row in range(observation.batch_size)]
     shown = [image for row in rows for image in row.images]
-    pictures = Pictures(model.config, weights, PLAIN, len(shown), False, 0)
+    pictures = Images(model.config, weights, PLAIN, len(shown), False, 0)
     size = BatchSize(batch, len(shown))
     buffers = BatchBuffers(model.config, weights, PLAIN, size, pictures, slots + 16)
     prefix = PackedPrefix(buffers, slots)
     prefix.write([len(row.images) for row in rows], [row.tokens for row in rows])
     table = modulation(model.config, weights.conditioning, steps)
-    loop = BatchLoop(buffers, Loop(steps, noise.shape[1]), by or weights, table)
+    loop = BatchLoop(buffers, EulerLoop(steps, noise.shape[1]), by or weights, table)
     loop.write(noise.numpy(), observation.state.numpy())
-    pictures.upload(shown)
+    send(pictures, shown)
     pictures.run()
     prefix.run()
     loop.run()
@@ -196,7 +199,7 @@ class TestBackend:
         made, noise = observations("pi05", [2, 0, 3, 1, 2, 2, 1], [7, 12, 3, 1, 5, 5, 9], horizon=5)
         exact = golden_model("pi05").sample(made, noise, 2)
         torch.testing.assert_close(backend.sample(made, noise, 2).actions, exact, atol=2e-5, rtol=2e-5)
-        assert backend.describe()["batches"] == ["8 observations with 16 pictures, H=5, 2 steps"]
+        assert backend.describe()["batches"] == ["8 observations with 16 images, H=5, 2 steps"]
 
     def test_a_call_of_more_pictures_than_before(self, backend: OnCpu) -> None:
         """Other buffers, and the first ones go on."""
@@ -246,7 +249,7 @@ class TestBackend:
         assert backend.told[told:] == ["run", "run", "run"], "vision, prefix and denoising of all four"
         with pytest.raises(ObservationError, match=r"5 observations at once.*policy\.warmup\(batches=5\)"):
             backend.sample(*observations("pi05", [2] * 5, [3] * 5, horizon=5), 2)
-        with pytest.raises(ObservationError, match=r"4 observations with 12 pictures"):
+        with pytest.raises(ObservationError, match=r"4 observations with 12 images"):
             backend.sample(*observations("pi05", [3] * 4, [3] * 4, horizon=5), 2)
 
     def test_a_forgotten_loops_batches_go_with_it(self, backend: OnCpu) -> None:

@@ -1,5 +1,6 @@
 """Conditioned observations in batched calls of the engine: each gets what it gets alone, whatever is beside it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,9 @@ from test_begin import OnCpu, Unrun, on_cpu
 from test_engine_batch import observations
 from torch import Tensor
 
-from turbopi.config import Kind
+from turbopi.config import Kind, ModelConfig
 from turbopi.engine.batch_runner import BatchRunner
-from turbopi.engine.conditioned import batch_form, batch_loop
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, batch_form, loop_of_batch
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, TokenTimes
 from turbopi.models.pi0.reference import Trace
@@ -27,6 +27,12 @@ STEPS, H, A = 3, 7, 32
 CAMERAS, TOKENS = [2, 0, 3, 1], [7, 12, 3, 0]
 FIELDS = ("images", "image_mask", "tokens", "token_mask", "state")
 JACOBIAN = ["jacobian", "jacobian_and_held"]
+
+
+def times_of(conditionings: Sequence[Conditioning | None], config: ModelConfig) -> tuple[float, ...]:
+    loop = loop_of_batch(conditionings, STEPS, H, config)
+    assert isinstance(loop, ConditionedLoop)
+    return loop.times
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -107,9 +113,10 @@ def test_one_loop_serves_observations_whose_times_differ(engine: OnCpu) -> None:
     close(engine.sample(made, noise, STEPS, conditioning=told).actions, golden_model(kind).sample(
         made, noise, STEPS, conditioning=told
     ))  # fmt: skip
-    loop = batch_loop(told, STEPS, H, engine.config)
-    alone = {one for each in told if each is not None for one in batch_loop([each], STEPS, H, engine.config).times}
-    assert loop.form == "tokens" and set(loop.times) == alone and str(loop) in engine.describe()["batches"][-1]
+    loop = loop_of_batch(told, STEPS, H, engine.config)
+    alone = {time for each in told if each is not None for time in times_of([each], engine.config)}
+    assert loop.form == "tokens" and set(times_of(told, engine.config)) == alone
+    assert any(one.endswith(str(loop)) for one in engine.describe()["batches"])
 
 
 @pytest.mark.parametrize("which", ["held", "held_and_identity", "jacobian_and_held"])
@@ -140,10 +147,10 @@ def test_a_batch_that_asks_for_nothing_is_the_plain_one_to_the_last_bit(engine: 
     made, noise = observations(engine.config.kind, CAMERAS, TOKENS, H)
     plain = engine.sample(made, noise, STEPS).actions
     engine.sample(made, noise, STEPS, conditioning=asked("held_and_identity", "held", None, "staircase"))
-    captured = len(engine._batches._graphs)
+    captured = len(engine._graphs.entries)
     for nothing in ([None] * 4, [Conditioning(), None, Conditioning(held=np.zeros(H, bool)), None]):
         assert torch.equal(engine.sample(made, noise, STEPS, conditioning=nothing).actions, plain)
-    assert len(engine._batches._graphs) == captured
+    assert len(engine._graphs.entries) == captured
 
 
 @pytest.mark.slow
@@ -152,14 +159,14 @@ def test_what_is_held_and_what_pulls_changes_without_a_new_capture_and_ends_with
     made, noise = observations(kind, CAMERAS, TOKENS, H)
     first = asked("held", None, "identity", "held")
     alone = engine.sample(made, noise, STEPS, conditioning=first).actions
-    captured = len(engine._batches._graphs)
+    captured = len(engine._graphs.entries)
     other = asked(None, "held_and_identity", "held", "identity")
     close(engine.sample(made, noise, STEPS, conditioning=other).actions, golden_model(kind).sample(
         made, noise, STEPS, conditioning=other
     ))  # fmt: skip
     engine.sample(*observations(kind, [2, 2, 2], [3, 3, 3], H), STEPS, conditioning=asked(*["identity"] * 3))
     assert torch.equal(engine.sample(made, noise, STEPS, conditioning=first).actions, alone)
-    assert len([key for key in engine._batches._graphs if key[0] == "denoise"]) <= captured
+    assert len([key for key in engine._graphs.entries if key.part == "denoise"]) <= captured
 
 
 @pytest.mark.parametrize("which", [["held", None], ["staircase", "identity"], ["jacobian", "jacobian_and_held"]])
@@ -222,7 +229,7 @@ class TestStrict:
         told = len(engine.told)
         engine.sample(made, noise, STEPS, conditioning=asked("identity", None, "held", "held_and_identity"))
         assert engine.told[told:] == ["run"] * 3
-        with pytest.raises(ObservationError, match=r"4 observations with 8 pictures, H=7, 3 steps, by token, 7 times"):
+        with pytest.raises(ObservationError, match=r"4 observations with 8 images, H=7, 3 steps, by token, 7 times"):
             engine.sample(made, noise, STEPS, conditioning=asked("warm_start", None, None, None))
         with pytest.raises(ObservationError, match=r"warmup\(batches=4\) with their real_time modes or conditionings"):
             engine.sample(made, noise, STEPS, conditioning=asked("warm_start", None, None, None))
@@ -244,7 +251,7 @@ class TestStrict:
         engine = on_cpu(cls=Unrun)
         made, noise = observations("pi05", [1] * 16, [3] * 16, H)
         engine.warmup_batches(rows_of(made, slice(1)), STEPS, H, [16], asked("jacobian")[0])
-        assert engine._batches.warm_sizes("jacobian") == {max(BatchRunner.JACOBIAN_COSTS)} == {8}
+        assert engine._graphs.batch_sizes("jacobian") == {max(BatchRunner.JACOBIAN_COSTS)} == {8}
         engine.strict = True
         told = len(engine.told)
         engine.sample(made, noise, STEPS, conditioning=asked(*["jacobian"] * 16))
@@ -263,10 +270,10 @@ def test_what_a_batch_makes_of_each_form() -> None:
     forms = [batch_form(one) for one in (*asked(None, "held", "jacobian"), euler, Conditioning())]
     assert forms == ["plain", "tokens", "jacobian", "tokens", "plain"]
     assert batch_form(Conditioning(integration=Integration("ab2", (1.0, 0.5, 0.0)))) == "solver"
-    assert batch_loop([None, Conditioning()], STEPS, H, config) == Loop(STEPS, H)
-    own = batch_loop(asked("held"), STEPS, H, config)
-    assert own == batch_loop([None, *asked("identity")], STEPS, H, config) and len(own.times) == STEPS + 1
-    assert batch_loop(asked("held", "jacobian"), STEPS, H, config).form == "jacobian"
+    assert loop_of_batch([None, Conditioning()], STEPS, H, config) == EulerLoop(STEPS, H)
+    own = loop_of_batch(asked("held"), STEPS, H, config)
+    assert own == loop_of_batch([None, *asked("identity")], STEPS, H, config) and own.rows == STEPS + 1
+    assert loop_of_batch(asked("held", "jacobian"), STEPS, H, config).form == "jacobian"
 
 
 def test_too_many_times_of_all_rows_are_refused() -> None:
@@ -278,4 +285,4 @@ def test_too_many_times_of_all_rows_are_refused() -> None:
     with pytest.raises(
         ObservationError, match=r"of 2 observations together have 29\d\d different .*fewer observations"
     ):
-        batch_loop(many, 29, 50, config)
+        loop_of_batch(many, 29, 50, config)

@@ -13,8 +13,8 @@ from test_engine import FIELDS, made_up
 from torch import Tensor
 
 from turbopi.config import Kind
-from turbopi.engine.conditioned import MOST_TIMES, conditioned_loop
-from turbopi.engine.graph_cache import MOST_LOOPS, Loop
+from turbopi.engine.graph_cache import MOST_LOOPS
+from turbopi.engine.loops import MOST_TIMES, EulerLoop, loop_of_call
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, TokenTimes
 from turbopi.models.pi0.solvers import Integration
@@ -61,8 +61,8 @@ def test_what_is_held_and_what_pulls_changes_without_a_new_capture(engine: OnCpu
     for one in asked:
         found = engine.sample(observation, noise, STEPS, conditioning=one).actions
         torch.testing.assert_close(found, expected(engine.config.kind, observation, noise, one), atol=2e-5, rtol=2e-5)
-        kept = len(engine._graphs) if kept is None else kept
-        assert len(engine._graphs) == kept
+        kept = len(engine._graphs.entries) if kept is None else kept
+        assert len(engine._graphs.entries) == kept
 
 
 def test_guidance_ends_with_the_call_that_asked_for_it(engine: OnCpu) -> None:
@@ -161,18 +161,16 @@ def test_few_conditioned_loops_are_kept() -> None:
     for first in np.linspace(0.1, 0.9, 2 * MOST_LOOPS):
         times = TokenTimes.of(np.linspace(first, 0, STEPS + 1)[:, None].repeat(7, 1))
         engine.sample(observation, noise, STEPS, conditioning=Conditioning(tokens=times))
-    assert len(engine._tables) == MOST_LOOPS and len(engine._calls) == MOST_LOOPS
+    assert len(engine._tables) == MOST_LOOPS and len(engine._graphs.entries) == MOST_LOOPS + 1
 
 
 def test_a_loop_is_named_by_what_its_graph_is_for() -> None:
     config = golden_model("pi05").config
     held, staircase = conditioned("held", STEPS, 7, 32), conditioned("staircase", STEPS, 7, 32)
-    assert conditioned_loop(None, STEPS, 7, config) == conditioned_loop(Conditioning(), STEPS, 7, config) == Loop(4, 7)
-    assert conditioned_loop(held, STEPS, 7, config) == conditioned_loop(
-        conditioned("identity", STEPS, 7, 32), STEPS, 7, config
-    )
-    assert str(conditioned_loop(held, STEPS, 7, config)) == "H=7, 4 steps, by token, 5 times"
-    assert conditioned_loop(staircase, STEPS, 7, config).times != conditioned_loop(held, STEPS, 7, config).times
+    assert loop_of_call(None, STEPS, 7, config) == loop_of_call(Conditioning(), STEPS, 7, config) == EulerLoop(4, 7)
+    assert loop_of_call(held, STEPS, 7, config) == loop_of_call(conditioned("identity", STEPS, 7, 32), STEPS, 7, config)
+    assert str(loop_of_call(held, STEPS, 7, config)) == "H=7, 4 steps, by token, 5 times"
+    assert loop_of_call(staircase, STEPS, 7, config).table != loop_of_call(held, STEPS, 7, config).table
 
 
 def test_too_many_times_are_refused() -> None:
@@ -180,7 +178,7 @@ def test_too_many_times_are_refused() -> None:
     times = np.linspace(1, 0, 30 * 50).reshape(30, 50)
     asked = Conditioning(tokens=TokenTimes.of(np.sort(times, axis=0)[::-1]))
     with pytest.raises(ObservationError, match=f"1451 different values; at most {MOST_TIMES} fit"):
-        conditioned_loop(asked, 29, 50, config)
+        loop_of_call(asked, 29, 50, config)
 
 
 def test_backends_say_which_forms_they_have() -> None:

@@ -17,9 +17,10 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
 from turbopi.engine import forward
 from turbopi.engine import weights as engine_weights
-from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Images, StaticCall
 from turbopi.engine.emulate import RoundedWeights, rounded
-from turbopi.engine.graph_cache import Loop, RecentLoops
+from turbopi.engine.graph_cache import GraphCache
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, Loop
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.plain import PLAIN
@@ -61,7 +62,7 @@ def engine_actions(
     shape = shape_of(observation, noise, STEPS)
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, torch.float32)
     table = modulation(model.config, weights.conditioning, STEPS)
-    pictures = Pictures(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
+    pictures = Images(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
     call = StaticCall(model.config, weights, PLAIN, shape, pictures, cache, table)
     return answer(call, observation, noise), len(made)
 
@@ -220,9 +221,8 @@ def fused(device: torch.device, quantization: Quantization | None, precision: Ti
     state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
     backend._weights = pack(backend.config, state, backend._quantized)
     backend._expert = ExpertStore(backend._weights.expert, device, {"packed": backend._packed, "fp8": backend._in_fp8})
-    backend._kernels, backend._calls, backend._graphs, backend._ops = {}, {}, {}, PLAIN
-    backend._recent = RecentLoops(backend._forget)
-    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
+    backend._kernels, backend._ops = {}, PLAIN
+    backend._graphs = GraphCache(backend._forget)
     return backend
 
 
@@ -237,8 +237,8 @@ def places(layers: Sequence[GemmaLayer[Any]]) -> set[str]:
     return {x.device.type for layer in layers for x in vars(layer).values() if x is not None}
 
 
-PLAIN_LOOP, BY_TOKEN = Loop(2, 5), Loop(2, 5, "tokens", (1.0, 0.5, 0.0))
-JACOBIAN = Loop(2, 5, "jacobian", (1.0, 0.5, 0.0))
+PLAIN_LOOP, BY_TOKEN = EulerLoop(2, 5), ConditionedLoop(2, 5, (1.0, 0.5, 0.0))
+JACOBIAN = ConditionedLoop(2, 5, (1.0, 0.5, 0.0), True)
 
 
 def batch_weights(backend: FusedBackend, loop: Loop) -> Weights:
@@ -292,7 +292,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
 def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
     backend = fused(CPU, whole_calibration())
     refused: dict[User, Any] = {
-        User("single", Loop(steps, 60), rows): "too many" for steps, rows in ((5, 968), (10, 968), (10, 1224))
+        User("single", EulerLoop(steps, 60), rows): "too many" for steps, rows in ((5, 968), (10, 968), (10, 1224))
     }
     backend._kernels = dict(refused)
     told = backend.describe()
@@ -302,7 +302,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]
     kernel = SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None)
-    made = {User("single", Loop(10, 10), 968): kernel}
+    made = {User("single", EulerLoop(10, 10), 968): kernel}
     backend._kernels = refused | made
     assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
     clock[0] = 1795.4
@@ -322,9 +322,9 @@ def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyP
         raise BackendUnavailable("it holds 3 clusters")
 
     monkeypatch.setattr(backend, "_denoising_kernel", refuse)
-    assert all(backend._make_denoiser(CallShape(2, slots, Loop(5, 10)), None) is None for slots in (16, 32, 48))
-    assert tried == [Loop(5, 10)]
-    assert [(user.loop, why) for user, why in backend._refused().items()] == [(Loop(5, 10), "it holds 3 clusters")]
+    assert all(backend._make_denoiser(CallShape(2, slots, EulerLoop(5, 10)), None) is None for slots in (16, 32, 48))
+    assert tried == [EulerLoop(5, 10)]
+    assert [(user.loop, why) for user, why in backend._refused().items()] == [(EulerLoop(5, 10), "it holds 3 clusters")]
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

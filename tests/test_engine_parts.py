@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_begin import OnCpu, on_cpu
 from test_capture import DONE, FakeCuda, capture
+from test_engine import send
 from test_engine_batch import observations
 from test_resize import Resizing, picture
 from torch import Tensor
@@ -20,7 +21,7 @@ from torch import Tensor
 from turbopi.config import ImageResize
 from turbopi.engine import call, forward
 from turbopi.engine.batch import BatchBuffers, BatchSize, PackedPrefix
-from turbopi.engine.call import Part, Pictures
+from turbopi.engine.call import Images, Part
 from turbopi.engine.forward import MOST_ROWS, row_chunks
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import Weights, pack
@@ -106,8 +107,8 @@ class TestAdded:
             monkeypatch.setattr(forward, "HEAD_LAYERS", layers)
             found = []
             for ops in (PLAIN, adding(every)):
-                pictures = Pictures(golden_model("pi05").config, packed(), ops, 5, False, 0)
-                pictures.upload(shown)
+                pictures = Images(golden_model("pi05").config, packed(), ops, 5, False, 0)
+                send(pictures, shown)
                 pictures.run()
                 found.append(pictures.embs)
             assert bool(found[0].isfinite().all()) and torch.equal(*found)
@@ -147,7 +148,7 @@ def prefix(ops: Ops, fp8: bool, monkeypatch: pytest.MonkeyPatch, most: int, *, r
     model = golden_model("pi05")
     config = model.config
     weights = pack(config, dict(model.state_dict()), in_fp8 if fp8 else lambda place, matrix: matrix)
-    pictures = Pictures(config, weights, PLAIN, 6, False, 0)
+    pictures = Images(config, weights, PLAIN, 6, False, 0)
     pictures.embs.normal_(generator=torch.Generator().manual_seed(0))
     buffers = BatchBuffers(config, weights, ops, BatchSize(4, 6), pictures, 160)
     run = PackedPrefix(buffers, 150)
@@ -200,10 +201,10 @@ class TestPictures:
         found = []
         for part, heads in ((count, 1), (2, -(-count // 2))):
             monkeypatch.setattr(call, "PART", part)
-            pictures = Pictures(golden_model("pi05").config, weights, PLAIN, count, dtype == torch.float32, 0)
+            pictures = Images(golden_model("pi05").config, weights, PLAIN, count, dtype == torch.float32, 0)
             uploads = pictures.uploads(shown, None, False)
             assert len(uploads) == heads
-            pictures.upload(shown)
+            send(pictures, shown)
             pictures.run()
             found.append(pictures.embs)
         assert bool(found[0].isfinite().all()) and torch.equal(*found)
@@ -254,7 +255,7 @@ class TestPictures:
 
         monkeypatch.setattr(Part, "write", telling_write)
         config = golden_model("pi05").config
-        pictures = Pictures(config, packed(), PLAIN, 5, False, 0)
+        pictures = Images(config, packed(), PLAIN, 5, False, 0)
         graph = capture(pictures.run)
         shown = [picture(config.vision.image_size, config.vision.image_size)] * 5
         DONE.clear()

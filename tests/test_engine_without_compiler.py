@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from turbopi.engine.without_compiler import FEW, OPS, linear_geglu, product
+from turbopi.engine.without_compiler import FEW, OPS, linear_geglu, matmul
 from turbopi.kernels.plain import PLAIN
 
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -31,8 +31,8 @@ def test_products_keep_their_sums_and_change_what_they_start_from(dtype: torch.d
     a, weight, start = randn(g, 7, 64, dtype=dtype), randn(g, 96, 64, dtype=dtype) / 8, randn(g, 7, 96)
     start[:, 5] = -torch.inf
     exact, given = a.float() @ weight.float().t(), start.clone()
-    close(product(a, weight), exact, torch.float32)
-    assert product(a, weight, given, alpha=0.25) is given
+    close(matmul(a, weight), exact, torch.float32)
+    assert matmul(a, weight, given, alpha=0.25) is given
     close(given, start + exact / 4, torch.float32)
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.graph_cache import Loop
-from turbopi.engine.solving import evaluation_loops
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, SolverLoop
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
@@ -201,8 +200,8 @@ def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_
 
     monkeypatch.setattr(denoise, "DenoiseKernel", make)
     kernels.refuse = "too small"
-    shapes = [CallShape(3, slots, Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))) for slots in (16, 32)]
-    assert [backend._make_keeper(shape, backend._call(shape).times.table) for shape in shapes] == [None, None]
+    shapes = [CallShape(3, slots, ConditionedLoop(2, 10, (1.0, 0.5, 0.0), True)) for slots in (16, 32)]
+    assert [backend._make_keeper(shape, backend._table(shape.loop)) for shape in shapes] == [None, None]
     assert len(tried) == 1 and not backend._expert.users["packed"] and not backend._expert._built
 
 
@@ -222,9 +221,9 @@ def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[
 
 def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
+    table = backend._table(EulerLoop(2, 10))
     for cameras in (1, 2, 3, 4):
-        assert backend._make_denoiser(CallShape(cameras, 16, Loop(2, 10)), table) is not None
+        assert backend._make_denoiser(CallShape(cameras, 16, EulerLoop(2, 10)), table) is not None
     tokens, most = backend.config.vision.num_tokens, -(-backend.config.max_prompt_tokens // 16) * 16
     assert [kernel.cache_rows for kernel in kernels.made] == [3 * tokens + most, 4 * tokens + most]
 
@@ -236,11 +235,11 @@ def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_
     actions(pi0)
     assert list(pi0.describe()["denoising"]) == ["operations, as it covers Pi0.5, this model is pi0"]
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX)), table) is not None
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX + 1)), table) is None
+    table = backend._table(EulerLoop(2, 10))
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, denoise.MAX_SUFFIX)), table) is not None
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, denoise.MAX_SUFFIX + 1)), table) is None
     monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
-    assert backend._make_denoiser(CallShape(3, 16, Loop(2, 9)), table) is None
+    assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, 9)), table) is None
     told = backend.describe()["denoising"]
     assert told["one CUDA kernel"] == ["H=56, 2 steps"]
     assert told["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
@@ -292,7 +291,7 @@ class OnFakeGpu:
 
     def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
-        self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).times.table
+        self.table = self.backend._table(EulerLoop(2, 10))
         self.backend.device = self.backend._expert._device = GPU
         layer: Any = GemmaLayer(**{name: Placed(CPU) for name in MATRICES}, norm1=None, norm2=None)
         self.backend._weights.expert[:] = [layer] * 3
@@ -313,8 +312,8 @@ class OnFakeGpu:
     def denoise(self, steps: int, refuse: str | None = None) -> bool:
         """Whether a loop of so many steps has a kernel."""
         self.kernels.refuse = refuse
-        shape = CallShape(3, 16, Loop(steps, 10))
-        self.backend._recent.use(Loop(steps, 10))
+        shape = CallShape(3, 16, EulerLoop(steps, 10))
+        self.backend._graphs.loops.use(EulerLoop(steps, 10))
         return self.backend._make_denoiser(shape, self.table) is not None
 
 
@@ -343,23 +342,23 @@ def test_the_expert_comes_back_from_the_host_for_operations(gpu: OnFakeGpu) -> N
 
 def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgotten(gpu: OnFakeGpu) -> None:
     assert gpu.denoise(2) and not gpu.denoise(3, refuse="too small") and not gpu.denoise(4, refuse="too small")
-    gpu.backend._forget(Loop(3, 10))
+    gpu.backend._forget(EulerLoop(3, 10))
     assert gpu.places == {GPU}, "the loop of 4 steps still takes operations"
-    gpu.backend._forget(Loop(4, 10))
+    gpu.backend._forget(EulerLoop(4, 10))
     assert gpu.places == {CPU}
 
 
 def test_the_expert_stays_on_the_device_while_a_solvers_loop_reads_it_by_operations(gpu: OnFakeGpu) -> None:
-    solver = Loop(2, 10, "solver", (1.0, 0.5), Integration("ab2", (1.0, 0.5, 0.0)))
-    evaluation = Loop(1, 10, "tokens", solver.times)  # which may be a loop of its own
-    assert evaluation in evaluation_loops(solver)
-    gpu.backend._recent.use(solver)
+    solver = SolverLoop(2, 10, Integration("ab2", (1.0, 0.5, 0.0)))
+    evaluation = ConditionedLoop(1, 10, solver.integration.evaluated)  # which may be a loop of its own
+    assert evaluation in solver.evaluations
+    gpu.backend._graphs.loops.use(solver)
     gpu.kernels.refuse = "too small"
     assert gpu.backend._make_denoiser(CallShape(3, 16, evaluation), gpu.table) is None
-    gpu.backend._forget_all(evaluation)
+    gpu.backend._graphs.loops.evict(evaluation)
     assert gpu.places == {GPU}
-    gpu.backend._recent._loops.clear()
-    gpu.backend._forget_all(solver)
+    gpu.backend._graphs.loops._loops.clear()
+    gpu.backend._graphs.loops.evict(solver)
     assert gpu.places == {CPU}
 
 
@@ -371,15 +370,15 @@ def test_a_refused_first_kernel_leaves_no_packed_expert_behind(gpu: OnFakeGpu) -
 
 def test_the_packed_expert_goes_with_the_last_kernel_and_is_packed_anew_for_the_next(gpu: OnFakeGpu) -> None:
     assert gpu.denoise(2) and gpu.denoise(3)
-    gpu.backend._forget(Loop(2, 10))
+    gpu.backend._forget(EulerLoop(2, 10))
     assert gpu.backend._expert._built == {"packed": "packed"}, "the loop of 3 steps still has its kernel"
-    gpu.backend._forget(Loop(3, 10))
+    gpu.backend._forget(EulerLoop(3, 10))
     assert not gpu.backend._expert._built
     assert gpu.denoise(2) and gpu.packed_from == [{CPU}, {CPU}]
 
 
 def test_the_expert_leaves_the_device_with_the_last_batch_that_operations_denoise(gpu: OnFakeGpu) -> None:
-    loops = [Loop(2, 10), Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))]
+    loops = [EulerLoop(2, 10), ConditionedLoop(2, 10, (1.0, 0.5, 0.0), True)]
     for loop in loops:
         weights = gpu.backend._batch_denoises_by(loop, 4, 64)
         assert isinstance(weights, Weights) and weights.expert is gpu.backend._weights.expert and gpu.places == {GPU}

@@ -11,13 +11,15 @@ import pytest
 import torch
 from conditioned import BY_TOKEN, conditioned
 from conftest import GOLDEN, golden_cases, golden_folder, golden_model
-from test_engine import made_up, shape_of
+from test_engine import made_up, send
 
 from turbopi import backends
 from turbopi.config import ImageResize, Kind
 from turbopi.engine import forward
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
+from turbopi.engine.loops import EulerLoop
+from turbopi.engine.plan import GraphKey, bucket
 from turbopi.engine.runner import HostRow
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning
@@ -179,13 +181,14 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
     whole: dict[StaticCall, Graph] = {}
 
     def in_one(row: HostRow, noise: torch.Tensor) -> torch.Tensor:
-        call = next(c for s, c in runner._calls.items() if s == shape_of(observation, noise, 3))
+        key = GraphKey("answer", 1, len(row.images), False, bucket(len(row.tokens)), EulerLoop(3, horizon))
+        call = runner._graphs.entries[key].buffers
         if call not in whole:
             with pytest.MonkeyPatch.context() as patched:
                 patched.setattr(forward, "HEAD_LAYERS", None)
                 whole[call] = Graph(call.run, runner._pool, runner._stream)
             assert len(whole[call]._parts) == 1
-        call.pictures.upload(row.images)
+        send(call.images, row.images)
         call.write_inputs(noise[0].numpy(), row.state, row.tokens)
         whole[call].replay()
         return call.actions.clone()
@@ -193,7 +196,7 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
     horizon = checkpoint.config.model.action_horizon
     side = runner.config.vision.image_size
     runner.begin([np.zeros((side, side, 3), np.uint8)])
-    assert [len(graph._parts) for graph in runner._graphs.values()] == [2], "vision's head, and its rest"
+    assert [len(graph._parts) for graph, _ in runner._graphs.entries.values()] == [2], "vision's head, and its rest"
     for turn in range(2):
         for seed, (cameras, tokens) in enumerate([(2, 5), (3, 40), (2, 47), (1, 16), (2, 5), (0, 17), (3, 17)]):
             observation, _ = made_up("pi05", cameras, tokens, seed)
@@ -218,7 +221,7 @@ def test_pictures_of_any_size_give_the_actions_of_pictures_resized_on_the_host(n
     if floats:
         observation = dataclasses.replace(observation, images=observation.images.float() / 127.5 - 1)
     runner.warmup(observation, 3, noise.shape[1])
-    row, graphs = HostRow.of(observation, 0), len(runner._graphs)
+    row, graphs = HostRow.of(observation, 0), len(runner._graphs.entries)
     sizes = ((480, 640), (37, 53), (side, side), (720, 1280), (480, 640))
     for first, second in itertools.pairwise((*sizes, *sizes)):
         pictures = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in (first, second)]
@@ -227,7 +230,7 @@ def test_pictures_of_any_size_give_the_actions_of_pictures_resized_on_the_host(n
         found = runner.begin(pictures, way).finish(row.tokens, row.state, noise[0].numpy(), 3)
         assert torch.equal(found.actions, expected), (first, second)
         assert all(milliseconds > 0 for milliseconds in found.stage_ms.values()), found.stage_ms
-    assert len(runner._graphs) == graphs
+    assert len(runner._graphs.entries) == graphs
 
 
 def test_time_in_which_the_device_waits_for_the_host_is_the_prefixs() -> None:
@@ -355,11 +358,11 @@ def test_what_is_held_and_what_pulls_changes_without_a_new_capture(name: str, fo
     runner: Any = backend(name, "pi05", "bf16")
     observation, noise = made_up("pi05", 1, 7)
     alone = [runner.sample(observation, noise, 5, conditioning=conditioned(one, 5, 7, 32)).actions for one in forms]
-    graphs = len(runner._graphs)
+    graphs = len(runner._graphs.entries)
     for which, first in [*zip(forms, alone, strict=True)] * 2:
         again = runner.sample(observation, noise, 5, conditioning=conditioned(which, 5, 7, 32)).actions
         assert torch.equal(again, first)
-    assert not torch.equal(*alone) and len(runner._graphs) == graphs
+    assert not torch.equal(*alone) and len(runner._graphs.entries) == graphs
 
 
 @pytest.mark.parametrize("which", ["held", "staircase", "identity"])

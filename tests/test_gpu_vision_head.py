@@ -15,7 +15,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends import Precision
 from turbopi.checkpoint import random_checkpoint
 from turbopi.engine import call, forward
-from turbopi.engine.call import Pictures
+from turbopi.engine.call import Images
 from turbopi.preprocess.images import fitted
 from turbopi.quantization.calibration_file import Quantization
 
@@ -47,12 +47,12 @@ def test_vision_in_two_graphs_gives_what_it_gives_in_one(precision: Precision, m
     found = []
     for layers, parts in ((forward.HEAD_LAYERS, 2), (None, 1)):
         monkeypatch.setattr(forward, "HEAD_LAYERS", layers)
-        runner._graphs.clear()
+        runner._graphs.entries.clear()
         runner.begin(pictures)
         torch.cuda.synchronize()
-        (graph,) = runner._graphs.values()
+        ((graph, images),) = runner._graphs.entries.values()
         assert len(graph._parts) == parts
-        found.append(runner._pictures[2, False].embs[: 2 * 256].clone())
+        found.append(images.embs[: 2 * 256].clone())
     assert bool(found[0].isfinite().all()) and torch.equal(*found)
 
 
@@ -69,7 +69,7 @@ def test_pictures_in_three_parts_give_what_they_give_in_one(
 
     def tokens(part: int, given: list[np.ndarray], graphs: int) -> torch.Tensor:
         monkeypatch.setattr(call, "PART", part)
-        pictures = Pictures(runner.config, runner._weights, runner._ops, len(given), False, 0)
+        pictures = Images(runner.config, runner._weights, runner._ops, len(given), False, 0)
         graph = runner._capture(pictures.run, None)
         assert len(graph._parts) == graphs, "one for each head, and one for the rest"
         found = []
@@ -96,7 +96,7 @@ def test_pictures_of_any_size_in_parts_give_what_they_give_resized_on_the_host()
     sizes = [(480, 640), (224, 224), (360, 480)]
     chosen = [(224, 224) if 8 <= i < 16 else sizes[i % 3] for i in range(20)]
     shown = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in chosen]
-    pictures = Pictures(runner.config, runner._weights, runner._ops, len(shown), False, 0)
+    pictures = Images(runner.config, runner._weights, runner._ops, len(shown), False, 0)
     usual = runner._capture(pictures.run, None)
     resized = runner._capture(pictures.run_resized, None, like=usual)
     found = []

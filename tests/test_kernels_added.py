@@ -15,7 +15,7 @@ from test_gpu_vision_head import runner_of
 
 from turbopi.backends import Precision
 from turbopi.engine.batch import BatchBuffers, BatchSize, PackedPrefix
-from turbopi.engine.call import Pictures
+from turbopi.engine.call import Images
 from turbopi.kernels import plain
 from turbopi.kernels.interface import VisionStream
 from turbopi.kernels.portable.quantize import quantize
@@ -157,7 +157,7 @@ def test_a_batchs_prefix_of_full_size_is_as_without(precision: Precision) -> Non
     found: list[Tensor] = []
     for add_linear in (None, recording, recording):
         ops = dataclasses.replace(usual, add_linear=add_linear)
-        pictures = Pictures(config, weights, ops, 8, False, 0)
+        pictures = Images(config, weights, ops, 8, False, 0)
         pictures.embs.copy_(torch.randn(pictures.embs.shape, generator=torch.Generator().manual_seed(0)))
         buffers = BatchBuffers(config, weights, ops, BatchSize(4, 8), pictures, 4 * 48)
         prefix = PackedPrefix(buffers, 4 * 48)

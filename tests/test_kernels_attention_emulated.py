@@ -97,7 +97,7 @@ def test_packed(machine: Machine) -> None:
     tile, heads, lengths, spare = AttentionTile(24, 16, wide=True), 4, [33, 3, 20], 5
     rows = sum(lengths) + spare
     prompts = [np.arange(length, dtype=np.int64) for length in lengths]
-    made = pack_rows([0] * 3, prompts, batch=3, rows=rows, per_picture=1, heads=heads)
+    made = pack_rows([0] * 3, prompts, batch=3, rows=rows, per_image=1, heads=heads)
     starts, sizes = torch.from_numpy(made.segments)
     segments = Segments(starts, sizes, torch.from_numpy(made.tiles))
     q, k, v = random(rows * heads, tile.dim), random(rows, tile.dim, seed=1), random(rows, tile.dim, seed=2)

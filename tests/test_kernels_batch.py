@@ -42,7 +42,7 @@ def packed(lengths: list[int], spare: int, batch: int) -> tuple[Segments, Tensor
     """Segments of observations of prompts alone, and where their rows come from."""
     prompts = [np.arange(length, dtype=np.int64) for length in lengths]
     rows = sum(lengths) + spare
-    made = pack_rows([0] * len(lengths), prompts, batch=batch, rows=rows, per_picture=1, heads=HEADS)
+    made = pack_rows([0] * len(lengths), prompts, batch=batch, rows=rows, per_image=1, heads=HEADS)
     segments, tiles = torch.from_numpy(made.segments).to(DEVICE), torch.from_numpy(made.tiles).to(DEVICE)
     return Segments(segments[0], segments[1], tiles), torch.from_numpy(made.source).to(DEVICE)
 

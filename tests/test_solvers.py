@@ -15,8 +15,7 @@ from test_fused_choice import TwinKernel, fused, kernels
 from torch import Tensor
 
 from turbopi.config import Kind, Solver
-from turbopi.engine.conditioned import conditioned_loop
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import EulerLoop, loop_of_call
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes
 from turbopi.models.pi0.denoise import time_grid
 from turbopi.models.pi0.reference import Trace
@@ -262,19 +261,19 @@ def test_kernels_of_a_solvers_loop_are_forgotten_with_it_unless_another_loop_has
         asked = Conditioning(integration=Integration(solver, UNEVEN))
         backend.sample(case.observation, case.noise, 3, conditioning=asked)
     assert len(kernels.made) == 3, "both evaluate at the same times"
-    loops = list(backend._recent)
+    loops = list(backend._graphs.loops)
     for loop, left in zip(loops, (3, 0), strict=True):
-        backend._recent._loops.pop(loop)
-        backend._forget_all(loop)
+        backend._graphs.loops._loops.pop(loop)
+        backend._graphs.loops.evict(loop)
         assert len(backend._made("single")) == left
 
 
 def test_a_solvers_loop_is_named_by_its_solver_and_grid() -> None:
     config = golden_model("pi05").config
     asked = Conditioning(integration=Integration("ab2", UNEVEN))
-    loop = conditioned_loop(asked, 3, 10, config)
+    loop = loop_of_call(asked, 3, 10, config)
     assert str(loop) == "H=10, 3 steps, ab2, t = 1, 0.7, 0.2, 0" and loop.rows == 3
-    assert str(Loop(1, 10, times=(0.5,))) == "H=10, 1 steps, t = 0.5"
+    assert str(EulerLoop(1, 10, 0.5)) == "H=10, 1 steps, t = 0.5"
     euler = Conditioning(integration=Integration("euler", UNEVEN))
-    assert conditioned_loop(euler, 3, 10, config).form == "solver"
-    assert conditioned_loop(euler, 3, 10, config, times_by_token=True).form == "tokens"
+    assert loop_of_call(euler, 3, 10, config).form == "solver"
+    assert loop_of_call(euler, 3, 10, config, times_by_token=True).form == "tokens"

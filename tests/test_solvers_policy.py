@@ -173,7 +173,7 @@ def test_a_solvers_loop_is_warmed_up(tiny: Any) -> None:
     policy = policy_on(Unrun, tiny, solver="exponential", num_denoising_steps=3)
     engine: Any = policy.backend
     policy.warmup(cameras=2, steps=[2, 3])
-    assert {str(loop) for loop in engine._recent} == {
+    assert {str(loop) for loop in engine._graphs.loops} == {
         "H=10, 2 steps, exponential, t = 1, 0.5, 0",
         "H=10, 3 steps, exponential, t = 1, 0.667, 0.333, 0",
     }

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from turbopi.config import Kind, preset
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
-from turbopi.engine.call import CallShape, Pictures
-from turbopi.engine.graph_cache import Loop
-from turbopi.engine.runner import BUCKET, bucket
+from turbopi.engine.call import CallShape, Images
+from turbopi.engine.loops import EulerLoop
+from turbopi.engine.plan import BUCKET, bucket
 from turbopi.engine.weights import modulation, pack
 from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.plain import PLAIN
@@ -96,13 +96,13 @@ def counted(kind: Kind, call: Call, monkeypatch: pytest.MonkeyPatch) -> Ran:
 @pytest.mark.parametrize("cameras", [0, 2])
 def test_one_observations_operations(kind: Kind, cameras: int, monkeypatch: pytest.MonkeyPatch) -> None:
     ran = Ran()
-    call = static_call(kind, CallShape(cameras, 48, Loop(STEPS, HORIZON)), ops=recording(ran))
+    call = static_call(kind, CallShape(cameras, 48, EulerLoop(STEPS, HORIZON)), ops=recording(ran))
     call.write_inputs(
         np.zeros((HORIZON, call.config.action_dim), np.float32),
         np.zeros(call.config.action_dim, np.float32),
         np.ones(40, np.int64),
     )
-    call.pictures.run()
+    call.images.run()
     call.encode()  # all denoising steps are one kernel
     if not cameras:  # an empty tower is run on no rows
         ran = Ran({key: uses for key, uses in ran.items() if key[1]})
@@ -114,12 +114,12 @@ def test_a_batchs_operations(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> Non
     model, ran, batch, cameras, slots = golden_model(kind), Ran(), 2, 1, 16
     config, ops, cpu = model.config, recording(ran), torch.device("cpu")
     weights = pack(config, dict(model.state_dict()))
-    pictures = Pictures(config, weights, ops, batch * cameras, False, 0)
+    pictures = Images(config, weights, ops, batch * cameras, False, 0)
     buffers = BatchBuffers(config, weights, ops, BatchSize(batch, batch * cameras), pictures, batch * slots)
     prefix = PackedPrefix(buffers, batch * slots)
     prefix.write([cameras] * batch, [np.ones(slots, np.int64)] * batch)
     table = modulation(config, weights.conditioning, STEPS)
-    loop = BatchLoop(buffers, Loop(STEPS, HORIZON), weights, None if table is None else table.to(cpu))
+    loop = BatchLoop(buffers, EulerLoop(STEPS, HORIZON), weights, None if table is None else table.to(cpu))
     pictures.run()
     prefix.run()
     loop.run()

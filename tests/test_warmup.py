@@ -29,7 +29,7 @@ H = 10
 
 def captures(policy: UnifiedPolicy) -> set[Any]:
     """The graphs that there are."""
-    return set(policy.backend._graphs)  # type: ignore[attr-defined]
+    return set(policy.backend._graphs.entries)  # type: ignore[attr-defined]
 
 
 def made(*, strict: bool = False, robot: str = "plain", cls: Any = Unrun) -> UnifiedPolicy:
@@ -320,6 +320,6 @@ def test_backends_warm_up_by_themselves_for_one_observation() -> None:
     backend = on_cpu(cls=Unrun)
     observation, noise = made_up("pi05", 2, 5)
     backend.warmup(observation, 2)
-    before = set(backend._graphs)
+    before = set(backend._graphs.entries)
     backend.sample(observation, torch.randn(1, golden_model("pi05").config.action_horizon, noise.shape[2]), 2)
-    assert set(backend._graphs) == before
+    assert set(backend._graphs.entries) == before

@@ -20,8 +20,9 @@ from turbopi import UnifiedPolicy, serve
 from turbopi.backends import BACKENDS, Backend, BackendSpec, LoadState, Precision, Sample
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
-from turbopi.engine.batch_runner import Asked, BegunBatch, Call, Finish
-from turbopi.engine.packing import pack_rows, split
+from turbopi.engine.batch_runner import BegunBatch, Call, Finish, Rows
+from turbopi.engine.packing import pack_rows
+from turbopi.engine.plan import split
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 
@@ -103,7 +104,7 @@ class SleepingBackend(Backend):
         cameras = [len(one) for one in pictures]
 
         def finish(
-            tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, asked: Asked
+            tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, conditionings: Rows
         ) -> Sample:
             return self.finish(bucket, cameras, tokens, state, noise)
 
@@ -125,8 +126,8 @@ class SleepingBackend(Backend):
         config = self.config
         if bucket > 1:
             rows = sum(cameras) * config.vision.num_tokens + bucket * config.max_prompt_tokens
-            per_picture, heads = config.vision.num_tokens, config.vlm.num_heads
-            pack_rows(cameras, tokens, batch=bucket, rows=rows, per_picture=per_picture, heads=heads)
+            per_image, heads = config.vision.num_tokens, config.vlm.num_heads
+            pack_rows(cameras, tokens, batch=bucket, rows=rows, per_image=per_image, heads=heads)
         self._inputs[: len(noise)] = noise
         for milliseconds in self.stages[bucket][1:]:
             self._device.launch(milliseconds)

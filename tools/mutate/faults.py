@@ -153,8 +153,8 @@ FAULTS = (
     Fault(
         "the length counts padding",
         "turbopi.engine",
-        'arrays["length"][0] = self.pictures.rows + len(tokens)',
-        'arrays["length"][0] = self.pictures.rows + len(padded)',
+        'arrays["length"][0] = self.images.rows + len(tokens)',
+        'arrays["length"][0] = self.images.rows + len(padded)',
         "the policy reads words that nobody said",
         (ENGINE,),
     ),

@@ -63,7 +63,7 @@ class Backend(ABC):
                     than its observations one by one
     submits         whether it has `submit`: several observations may be in flight
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
-                    `engine.cold_call.not_warm`. Set by the policy; a backend that does nothing of the kind needn't look
+                    `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
     """
 
     name: ClassVar[str]

@@ -1,6 +1,6 @@
 """Backend `cuda_graph`: a call is a `Graph` for pictures and one for all the rest, with stock PyTorch.
 
-What is captured, kept and refused: engine/runner.py; of batches: engine/batches.py.
+Which graphs there are: engine/plan.py; capture and replay: engine/runner.py; of batches: engine/batch_runner.py.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ from turbopi.engine import without_compiler
 from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
-from turbopi.engine.graph_cache import Loop
-from turbopi.engine.weight_placement import PackingRoom, is_conditioning
+from turbopi.engine.loops import Loop, Table
+from turbopi.engine.weight_placement import WeightPlacement, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.support.errors import BackendError
@@ -41,7 +41,7 @@ class CudaGraphBackend(BatchRunner, Backend):
         make_caches_writable()
         weights, ops = self._pack(load), self._make_ops()
         BatchRunner.__init__(self, self.config, weights, ops, self.device, joint=ops is without_compiler.OPS)
-        self._loops: dict[tuple[int, tuple[float, ...]], without_compiler.Denoiser] = {}  # by `Loop.table`
+        self._loops: dict[Table, without_compiler.Denoiser] = {}  # by `Loop.table`
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -53,8 +53,8 @@ class CudaGraphBackend(BatchRunner, Backend):
         return None
 
     def _pack(self, load: LoadState) -> Weights:
-        room = PackingRoom(self.config, self.device, partial(is_conditioning, self.config))
-        return pack(self.config, load(room, "f32" if self.precision == "f32" else "bf16"))
+        placement = WeightPlacement(self.config, self.device, partial(is_conditioning, self.config))
+        return pack(self.config, load(placement, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
         if PyTorchCompileBackend.unavailable(self.device) is not None:
@@ -75,5 +75,5 @@ class CudaGraphBackend(BatchRunner, Backend):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        if loop.table not in {other.table for other in self._recent if other.form == "plain"}:
+        if loop.table not in {other.table for other in self._graphs.loops if other.form == "plain"}:
             self._loops.pop(loop.table, None)

@@ -22,10 +22,9 @@ from turbopi.backends.device_lost import ADVICE
 from turbopi.backends.expert_store import ExpertStore, Layers, User, layer_on
 from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.engine.call import CallShape
-from turbopi.engine.graph_cache import Loop
-from turbopi.engine.runner import MAX_CAMERAS, bucket
-from turbopi.engine.solving import evaluation_loops
-from turbopi.engine.weight_placement import HOST, PackingRoom, is_conditioning
+from turbopi.engine.loops import Loop
+from turbopi.engine.plan import MAX_CAMERAS, bucket
+from turbopi.engine.weight_placement import HOST, WeightPlacement, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
@@ -144,8 +143,8 @@ class FusedBackend(CudaGraphBackend):
             """
             return self._plan is not None or name.startswith("expert.layers.") or is_conditioning(self.config, name)
 
-        room = PackingRoom(self.config, self.device, on_host)
-        weights = pack(self.config, load(room, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        placement = WeightPlacement(self.config, self.device, on_host)
+        weights = pack(self.config, load(placement, "bf16"), self._quantized, device=self.device, expert_device=HOST)
         self._expert = ExpertStore(weights.expert, self.device, {"packed": self._packed, "fp8": self._in_fp8})
         return weights
 
@@ -288,7 +287,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        if any(loop in evaluation_loops(other) for other in self._recent):  # a solver's graph goes on reading them
+        if any(loop in other.evaluations for other in self._graphs.loops):  # a solver's graph goes on reading them
             return
         for user in [user for user in self._kernels if user.loop == loop]:
             del self._kernels[user]

@@ -16,7 +16,7 @@ from torch import Tensor
 from turbopi.backends.base import Backend, LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
-from turbopi.engine.cold_call import not_warm
+from turbopi.engine.plan import cold_call
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 from turbopi.models.pi0.reference import Pi0Model
@@ -140,7 +140,7 @@ class PyTorchCompileBackend(PyTorchBackend):
                     f"strict: this call needs {shape}, which backend {self.name!r} would have to compile within the "
                     "call, and warm-up covers one observation at a time: ask for them one by one"
                 )
-            raise not_warm(self.name, str(shape), warm, cameras=shape.cameras, horizons=shape.horizon)
+            raise cold_call(self.name, str(shape), warm, cameras=shape.cameras, horizons=shape.horizon)
         sample = super().sample(observation, noise, num_steps)
         self._compiled.add(shape)
         return sample

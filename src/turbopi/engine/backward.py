@@ -1,8 +1,7 @@
 """The vector-Jacobian product through the action expert, the prefix's keys and values fixed: exact, as operations.
 
-Forward as `forward.expert_output`, but that what the way back needs is kept; then back, layer by layer. What a layer
-keeps is kept for one evaluation. The suffix's own keys and values depend on its tokens, so gradients go through the
-cache's last rows, too.
+Forward as `forward.expert_output`, but each layer saves what backward needs, for one evaluation; then backward, layer
+by layer. The suffix's own keys and values depend on its tokens, so gradients go through the cache's last rows, too.
 
 Shapes: T suffix tokens, D width, K head_dim, n query heads, R cache rows.
 """
@@ -24,18 +23,18 @@ from turbopi.models import family_of
 
 
 @dataclass(frozen=True)
-class KeptLayer:
-    """What one layer's way back needs."""
+class SavedLayer:
+    """What backward through one layer needs."""
 
     x: Tensor  # [T, D]  the residual stream as attention's norm reads it
-    attention: Any  # as `BackwardOps.attention` keeps it
+    attention: Any  # as `BackwardOps.attention` saves it
     middle: Tensor  # [T, D]  the residual stream as the MLP's norm reads it
     gate_up: Tensor  # [T, 2F]
 
 
 @dataclass(frozen=True)
 class Expert:
-    """The expert on one cache with one modulation, forward and back."""
+    """The expert on one cache with one modulation, forward and backward."""
 
     config: ModelConfig
     weights: Weights
@@ -49,9 +48,9 @@ class Expert:
     hidden: Tensor | None = None  # bool[T, 1, R]: which rows a token doesn't see, of several observations' together
     rows: Tensor | None = None  # int32[T]: of a table [2 * layers + 1, 3, U, D], as `vjp` alone takes it
 
-    def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
-        """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
-        config, ops, back, g, kept = self.config, self.ops, self.back, self.config.expert, []
+    def forward(self, tokens: Tensor) -> tuple[Tensor, list[SavedLayer], Tensor]:
+        """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer saves, the last stream)."""
+        config, ops, back, g, saved = self.config, self.ops, self.back, self.config.expert, []
         slots, heads = self._slots(tokens), self._heads(tokens)
         hidden_keys = {} if self.hidden is None else {"hidden": self.hidden}
         x: Tensor = tokens
@@ -69,19 +68,19 @@ class Expert:
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
             gate_up, hidden = back.gate_up(normed, layer.gate_up)
             y, gate = back.down(hidden, layer.down), next_gate
-            kept.append(KeptLayer(start, for_vjp, x, gate_up))
+            saved.append(SavedLayer(start, for_vjp, x, gate_up))
         scale, shift, _ = norm_weights(self.table, 2 * g.depth, self.weights.expert_norm)
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
-        return normed.float(), kept, x
+        return normed.float(), saved, x
 
-    def kept(self, step: KeptStep) -> tuple[list[KeptLayer], Tensor]:
-        """What `forward` keeps of each layer and the last stream, where a denoiser went forward."""
+    def saved(self, step: KeptStep) -> tuple[list[SavedLayer], Tensor]:
+        """What `forward` saves of each layer and the last stream, where a denoiser went forward."""
         *streams, last = step.stream
         attended = self.back.kept_attention(step.q, self.cache_k, self.cache_v, *self._heads(last))
         layers = zip(streams[::2], attended, streams[1::2], step.gate_up, strict=True)
-        return [KeptLayer(*layer) for layer in layers], last
+        return [SavedLayer(*layer) for layer in layers], last
 
-    def vjp(self, kept: list[KeptLayer], last: Tensor, d_out: Tensor) -> Tensor:
+    def vjp(self, saved: list[SavedLayer], last: Tensor, d_out: Tensor) -> Tensor:
         """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
         back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
         heads = self._heads(last)
@@ -98,7 +97,7 @@ class Expert:
 
         d_x, d_y = norm(d_out.to(last.dtype), last, 2 * g.depth, self.weights.expert_norm, None)
         for i in reversed(range(g.depth)):
-            layer, had = layers[i], kept[i]
+            layer, had = layers[i], saved[i]
             d_normed = back.gate_up_vjp(back.down_vjp(d_y, layer.down, had.gate_up), layer.gate_up)
             d_x, d_y = norm(d_normed, had.middle, 2 * i + 1, layer.norm2, d_x)
             d_attended = back.out_vjp(d_y, layer.out)
@@ -110,19 +109,19 @@ class Expert:
         return self.cache_k.shape[1] - len(tokens)
 
     def _heads(self, tokens: Tensor) -> tuple[Tensor, int, int, bool]:
-        """What attention is told of what its queries see: length, slots, heads, whether there is a state token."""
+        """What says which keys attention's queries see: length, slots, heads, whether there is a state token."""
         # beside `hidden` there is none: that says what the state's token doesn't see
         state_token = family_of(self.config).state_token and self.hidden is None
         return self.length, self._slots(tokens), self.config.expert.num_heads, state_token
 
 
-def way_back(ops: Ops, config: ModelConfig, tokens: int, *, masked: bool = False) -> BackwardOps:
+def backward_ops(ops: Ops, config: ModelConfig, tokens: int, *, masked: bool = False) -> BackwardOps:
     """The operations that `Expert` takes for so many tokens. masked: with `Expert.hidden`."""
     return PLAIN_BACKWARD if ops.backward is None else ops.backward(config.expert, tokens, masked)
 
 
 def jacobian_velocity(
-    expert: Expert, asked: Conditioned, step: int, x_t: Tensor, tokens: Tensor, time: Tensor
+    expert: Expert, conditioned: Conditioned, step: int, x_t: Tensor, tokens: Tensor, time: Tensor
 ) -> Tensor:
     """v_t float32[..., H, A] of x_t, pulled through the expert as `model.conditioning` says.
 
@@ -134,32 +133,43 @@ def jacobian_velocity(
     def of_actions(rows: Tensor) -> Tensor:
         return rows.view(*x_t.shape[:-2], -1, rows.shape[-1])[..., -horizon:, :]
 
-    out, kept, last = expert.forward(tokens)
+    out, saved, last = expert.forward(tokens)
     v_t = project(small, "action_out_proj", of_actions(out))
-    error = asked.error(step, x_t, v_t) * asked.weights
-    d_out = (asked.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"]
+    error = conditioned.error(step, x_t, v_t) * conditioned.weights
+    d_out = (conditioned.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"]
     if d_out.numel() == out.numel():
         d_out = d_out.view(out.shape)
     else:  # Pi0's state token has no velocity
         of_actions(every := torch.zeros_like(out)).copy_(d_out)
         d_out = every
-    d_tokens = of_actions(expert.vjp(kept, last, d_out))
+    d_tokens = of_actions(expert.vjp(saved, last, d_out))
     through = suffix_vjp(expert.config, small, x_t, time, d_tokens)
-    return v_t - asked.tokens.gain[step, ..., None] * (error - through)
+    return v_t - conditioned.tokens.gain[step, ..., None] * (error - through)
 
 
 def jacobian_step(
-    expert: Expert, asked: Conditioned, step: int, forward: KeepingDenoiser, x_t: Tensor, v_t: Tensor, next_x: Tensor
+    expert: Expert,
+    conditioned: Conditioned,
+    step: int,
+    forward: KeepingDenoiser,
+    x_t: Tensor,
+    v_t: Tensor,
+    next_x: Tensor,
 ) -> None:
     """`jacobian_velocity` and Euler's step behind it, of one observation of Pi0.5, where a denoiser goes forward.
 
     x_t float32[H, A]; v_t and next_x, the same, are written.
     """
-    caches, small, tokens, back = (expert.cache_k, expert.cache_v), expert.weights.small, asked.tokens, expert.back
-    kept, last = expert.kept(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
+    caches, small, tokens, back = (
+        (expert.cache_k, expert.cache_v),
+        expert.weights.small,
+        conditioned.tokens,
+        expert.back,
+    )
+    saved, last = expert.saved(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
     out, into = small["action_out_proj.weight"], small["action_in_proj.weight"]
-    error, d_out = back.pull(x_t, v_t, tokens.times[step], tokens.target, asked.weights, out, last.dtype)
-    d_tokens = expert.vjp(kept, last, d_out)
+    error, d_out = back.pull(x_t, v_t, tokens.times[step], tokens.target, conditioned.weights, out, last.dtype)
+    d_tokens = expert.vjp(saved, last, d_out)
     back.move(d_tokens, into, x_t, v_t, error, tokens.gain[step], tokens.steps[step], next_x)
 
 

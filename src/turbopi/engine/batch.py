@@ -1,6 +1,6 @@
-"""One call for several observations: their pictures, prefixes and action chunks as rows of the same products.
+"""One call for several observations: their images, prefixes and action chunks as rows of the same matmuls.
 
-A batched call is three graphs, one after the other: vision of so many pictures (`call.Pictures`), `PackedPrefix` of so
+A batched call is three graphs, one after the other: vision of so many images (`call.Images`), `PackedPrefix` of so
 many rows, and `BatchLoop`, all denoising steps of so many observations. Observations of other cameras, prompts and
 lengths stand side by side (packing.py); which rows are whose is said in device memory, so nothing is captured anew
 when that changes.
@@ -19,11 +19,11 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
-from turbopi.engine.backward import Expert, jacobian_velocity, way_back
-from turbopi.engine.call import Cache, Pictures
+from turbopi.engine.backward import Expert, backward_ops, jacobian_velocity
+from turbopi.engine.call import Cache, Images
 from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import ConditionedLoop, EulerLoop
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
@@ -32,7 +32,7 @@ from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.denoise import euler_step, step_size
 
-PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
+PLAIN_ROW = Conditioning()  # of an observation without a conditioning, or an empty place
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class BatchSize:
     """What buffers and graphs of a batch are fixed to, beside the prompts' bucket and the denoising loop."""
 
     batch: int  # observations
-    pictures: int  # of all of them together
+    images: int  # of all of them together
     float_images: bool = False  # as `CallShape`'s
 
 
@@ -54,7 +54,7 @@ class SharedRows:
     def __init__(self, config: ModelConfig, dtype: torch.dtype, device: torch.device) -> None:
         self._config = config
         self._cache = Cache.allocate(config, 0, device, dtype)
-        self._embs = self._pictures = torch.empty(0, config.vlm.width, dtype=dtype, device=device)
+        self._embs = self._images = torch.empty(0, config.vlm.width, dtype=dtype, device=device)
 
     def cache(self, rows: int) -> Cache:
         if rows > (has := self._cache.k.shape[1]):
@@ -67,10 +67,10 @@ class SharedRows:
         self._embs = self._grown(self._embs, rows)
         return self._embs[:rows]
 
-    def pictures(self, rows: int) -> Tensor:
-        """What vision makes of all pictures [rows, D]."""
-        self._pictures = self._grown(self._pictures, rows)
-        return self._pictures[:rows]
+    def images(self, rows: int) -> Tensor:
+        """What vision makes of all images [rows, D]."""
+        self._images = self._grown(self._images, rows)
+        return self._images[:rows]
 
     def _grown(self, buffer: Tensor, rows: int) -> Tensor:
         if rows <= len(buffer):
@@ -87,15 +87,15 @@ class BatchBuffers:
         weights: Weights,
         ops: Ops,
         size: BatchSize,
-        pictures: Pictures,
+        images: Images,
         prompt_slots: int,
         shared: SharedRows | None = None,
     ) -> None:
         """`prompt_slots`: the most of any call, of all observations together. Without `shared` rows it has its own."""
-        self.config, self.weights, self.ops, self.size, self.pictures = config, weights, ops, size, pictures
-        assert pictures.cameras == size.pictures
+        self.config, self.weights, self.ops, self.size, self.images = config, weights, ops, size, images
+        assert images.cameras == size.images
         table = weights.embed_tokens
-        self.device, self.rows = table.device, pictures.rows + prompt_slots
+        self.device, self.rows = table.device, images.rows + prompt_slots
         shared = shared or SharedRows(config, table.dtype, self.device)
         self.cache, self.embs = shared.cache(self.rows), shared.embs(self.rows)
         self.segments = torch.zeros((2, size.batch + 1), dtype=torch.int32, device=self.device)
@@ -103,11 +103,11 @@ class BatchBuffers:
 
 
 class PackedPrefix:
-    """Prefix of all observations of a batch: tokens of pictures, which are there, and prompts to keys and values."""
+    """Prefix of all observations of a batch: tokens of images, which are there, and prompts to keys and values."""
 
     def __init__(self, buffers: BatchBuffers, prompt_slots: int) -> None:
         self._buffers, config, device = buffers, buffers.config, buffers.device
-        self.rows = buffers.pictures.rows + prompt_slots
+        self.rows = buffers.images.rows + prompt_slots
         assert 0 < self.rows <= buffers.rows
         batch, heads = buffers.size.batch, config.vlm.num_heads
         fields = {
@@ -122,9 +122,9 @@ class PackedPrefix:
         self._embs = buffers.embs[: self.rows]
 
     def write(self, cameras: Sequence[int], tokens: Sequence[np.ndarray]) -> np.ndarray:
-        """Put what a call needs beside its pictures into the host's buffer. Returns the segments int32[2, B + 1].
+        """Put what a call needs beside its images into the host's buffer. Returns the segments int32[2, B + 1].
 
-        cameras  of each observation, how many pictures it has
+        cameras  of each observation, how many images it has
         tokens   of each, int64[valid prompt tokens]
         """
         config = self._buffers.config
@@ -133,7 +133,7 @@ class PackedPrefix:
             tokens,
             batch=self._buffers.size.batch,
             rows=self.rows,
-            per_picture=config.vision.num_tokens,
+            per_image=config.vision.num_tokens,
             heads=config.vlm.num_heads,
         )
         for name, array in self._arrays.items():
@@ -146,7 +146,7 @@ class PackedPrefix:
         batched = ops.batch or PLAIN_BATCH
         ops.transfer(self._host, self._flat)
         buffers.segments.copy_(inputs["segments"])
-        batched.embed_rows(inputs["source"], buffers.pictures.embs, weights.embed_tokens, self._embs)
+        batched.embed_rows(inputs["source"], buffers.images.embs, weights.embed_tokens, self._embs)
         rope = (buffers.rope[0][inputs["positions"]], buffers.rope[1][inputs["positions"]])
         segments, heads = Segments(inputs["segments"][0], inputs["segments"][1], inputs["tiles"]), config.vlm.num_heads
 
@@ -162,27 +162,27 @@ class PackedPrefix:
 class BatchLoop:
     """All denoising steps of a batch, from the keys and values that `PackedPrefix` left.
 
-    In a conditioned loop each action has its own time, step and pull, and an observation that asks for nothing has
-    openpi's. A plain loop has none of that.
+    In a conditioned loop each action has its own time, step and pull; of an observation without a conditioning they are
+    openpi's. An Euler loop has none of that.
     """
 
     def __init__(
         self,
         buffers: BatchBuffers,
-        loop: Loop,
+        loop: EulerLoop | ConditionedLoop,
         by: Weights
         | PairDenoiser,  # operations with these, perhaps others than those of `buffers`; or, of two, a kernel
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation; a conditioned loop's: [U, …]
     ) -> None:
-        assert loop.form != "solver" and (loop.form == "plain" or isinstance(by, Weights)), loop
-        self._loop = loop
+        by_token = loop if isinstance(loop, ConditionedLoop) else None
+        assert by_token is None or isinstance(by, Weights), loop
         self._buffers, self._by = buffers, by
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
         self._tokens = loop.horizon + family_of(config).state_token
-        self._asked = None if loop.form == "plain" else Conditioned.allocate(config, loop, device, batch)
-        self._times = StepTimes.of(config, loop, table, self._asked, device)
+        self._conditioned = None if by_token is None else Conditioned.allocate(config, by_token, device, batch)
+        self._times = StepTimes.of(config, loop, table, self._conditioned, device)
         chunk = (batch, loop.horizon, config.action_dim)
         fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
         self._host, host = allocate(fields, torch.device("cpu"), pinned=on_gpu)
@@ -210,19 +210,25 @@ class BatchLoop:
             array = self._arrays[name]
             array[: len(given)] = given
             array[len(given) :] = 0
-        if self._asked is None:
+        if self._conditioned is None:
             return
         for row in range(self._buffers.size.batch):
             one = conditionings[row] if conditionings is not None and row < len(conditionings) else None
-            self._asked.write(one or PLAIN_ROW, row)
+            self._conditioned.write(one or PLAIN_ROW, row)
             if one is not None:
                 self._arrays["noise"][row] = one.started(noise[row])
+
+    def trace(self, row: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What the last call left of one observation: keys and values [layer, length, K], x_t and v_t [N.., H, A]."""
+        cache, (start, length) = self._buffers.cache, (int(one) for one in self._buffers.segments[:, row])
+        rows = slice(start, start + length)
+        return cache.k[:, rows], cache.v[:, rows], self.x_t[:, row], self.v_t[:, row]
 
     def run(self, *_: Any) -> None:
         buffers, transfer = self._buffers, self._buffers.ops.transfer
         transfer(self._host, self._flat)
-        if self._asked is not None:
-            self._asked.upload()
+        if self._conditioned is not None:
+            self._conditioned.upload()
         if isinstance(self._by, Weights):
             self._run_operations(self._by)
         else:
@@ -235,23 +241,24 @@ class BatchLoop:
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
         self.x_t[0] = self._noise
-        if self._asked is None and family_of(self._buffers.config).modulated:
+        conditioned = self._conditioned
+        if conditioned is None and family_of(self._buffers.config).modulated:
             self._run_plain_steps(weights, rope)
             return
-        whole = self._whole_cache() if self._loop.form == "jacobian" else None
+        whole = self._whole_cache() if conditioned is not None and conditioned.loop.jacobian else None
         for step in range(self._steps):
-            x_t, asked = self.x_t[step], self._asked
-            if asked is None:
+            x_t = self.x_t[step]
+            if conditioned is None:
                 v_t = self._velocity(weights, step, rope)
                 self.x_t[step + 1] = euler_step(x_t, v_t, self._steps)
             else:
                 if whole is None:
-                    v_t = asked.pulled(step, x_t, self._velocity(weights, step, rope))
+                    v_t = conditioned.pulled(step, x_t, self._velocity(weights, step, rope))
                 else:
                     expert = self._expert(weights, step, rope, *whole)
                     tokens, time = self._suffix(weights, step), self._times.embedding(step)
-                    v_t = jacobian_velocity(expert, asked, step, x_t, tokens, time)
-                self.x_t[step + 1] = asked.next_x(step, x_t, v_t)
+                    v_t = jacobian_velocity(expert, conditioned, step, x_t, tokens, time)
+                self.x_t[step + 1] = conditioned.next_x(step, x_t, v_t)
             self.v_t[step] = v_t
 
     def _run_plain_steps(self, weights: Weights, rope: forward.Rope) -> None:
@@ -297,9 +304,9 @@ class BatchLoop:
         return tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
 
     def _whole_cache(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Keys and values of all prefixes with room for the suffixes' behind them, and what `Expert` is told is hidden.
+        """Keys and values of all prefixes with space for the suffixes' behind them, and what is hidden from `Expert`.
 
-        One product over the rows of all observations, most of them hidden: the way back has no attention of its own.
+        One matmul over the rows of all observations, most of them hidden: backward has no attention of its own.
         Rows that nothing was written to are 0, as 0 * NaN is NaN.
         """
         buffers, count, end = self._buffers, self._suffix_rows, self._whole_rows
@@ -314,5 +321,5 @@ class BatchLoop:
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._times.modulation(step)
-        back = way_back(buffers.ops, buffers.config, self._suffix_rows, masked=True)
+        back = backward_ops(buffers.ops, buffers.config, self._suffix_rows, masked=True)
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

@@ -1,4 +1,4 @@
-"""The plain operations with Inductor's kernels between the matrix products."""
+"""The plain operations with Inductor's kernels between the matmuls."""
 
 import inspect
 import os
@@ -59,7 +59,7 @@ def _batch() -> BatchOps:
 
 
 def compiled() -> Ops:
-    """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
+    """The same operations with torch.compile between the matmuls, for any number of tokens and keys.
 
     Where it is switched off (TORCH_COMPILE_DISABLE or TORCHDYNAMO_DISABLE is 1, which PyTorch reads when it compiles)
     `without_compiler.OPS`, as what suits a compiler is slower one by one.
@@ -72,7 +72,7 @@ def compiled() -> Ops:
     def compiled_attention(*args: Any) -> Tensor:
         return attention(*args, softmax=softmax)
 
-    way_back = backward.BetweenProducts(
+    backward_between_matmuls = backward.BetweenProducts(
         softmax=softmax,
         geglu=_compiled(backward.geglu),
         rope_split=rope,
@@ -97,7 +97,7 @@ def compiled() -> Ops:
         vision_attention=vision_attention,
         attention=compiled_attention,
         batch=_batch() if torch.cuda.is_available() else None,
-        backward=lambda expert, tokens, masked=False: way_back,
+        backward=lambda expert, tokens, masked=False: backward_between_matmuls,
         origin={**PLAIN.origin, "all else": "Inductor"},
     )
 

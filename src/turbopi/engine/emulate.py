@@ -35,7 +35,7 @@ def round_weight(weight: Tensor, directions: Directions | None = None, format: F
 
 
 class RoundedWeights:
-    """A model's matrices in eight bits, each rounded when it is first asked for and then held, a byte a weight.
+    """A model's matrices in eight bits, each rounded when it is first needed and then cached, a byte a weight.
 
     directions  of the sites that have them
     """
@@ -43,17 +43,17 @@ class RoundedWeights:
     def __init__(self, directions: Mapping[Site, Directions] | None = None, format: Format = FP8) -> None:
         self.format = format
         self._directions = directions or {}
-        self._held: dict[int, tuple[Tensor, ScaledMatrix]] = {}  # with the weight, so that no other comes to lie there
+        self._rounded: dict[int, tuple[Tensor, ScaledMatrix]] = {}  # with the weight: its id stays its own
 
     def __call__(self, site: Site, weight: Tensor) -> Tensor:
-        if id(weight) not in self._held:
-            self._held[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site), self.format)
-        return self._held[id(weight)][1].dequantized().to(weight.dtype)
+        if id(weight) not in self._rounded:
+            self._rounded[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site), self.format)
+        return self._rounded[id(weight)][1].dequantized().to(weight.dtype)
 
 
 @contextmanager
 def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None) -> Iterator[None]:
-    """For a while, products of these sites are of rounded numbers, of the weights' format."""
+    """For a while, matmuls of these sites are of rounded numbers, of the weights' format."""
     rounding = weights or RoundedWeights()
     changes: list[tuple[nn.Linear, Round, Round]] = []
     norms: list[tuple[AdaRMSNorm, Round]] = []
@@ -102,7 +102,7 @@ def replaced_in_norms(changes: list[tuple[AdaRMSNorm, Round]]) -> Iterator[None]
 
 @contextmanager
 def replaced(changes: list[tuple[nn.Linear, Round, Round]]) -> Iterator[None]:
-    """For a while, these products are of what the two functions make of their input and of their weight."""
+    """For a while, these matmuls are of what the two functions make of their input and of their weight."""
     try:
         for linear, inputs, weights in changes:
 

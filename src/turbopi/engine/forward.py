@@ -4,10 +4,10 @@ The prefix is compacted on the host: valid cameras, then valid prompt tokens, th
 sits at the end only and `length`, in device memory, says where it begins; so nothing is captured anew when the prompt
 or the state changes. The mathematics is `turbopi.models.pi0.reference`'s; only its order of work differs:
 
-  - matrices that share an input are one product; adaRMS comes from a table of all steps;
-  - a residual is added together with the norm behind it, or of many rows by the product in front of that, in place;
+  - matrices that share an input are one matmul; adaRMS comes from a table of all steps;
+  - a residual is added together with the norm behind it, or of many rows by the matmul in front of that, in place;
   - where the next matrix is a `ScaledMatrix`, an operation's result is rounded to E4M3 or int8 for it;
-  - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
+  - logits leave their matmul in float32 and keys beyond `length` get -inf before the softmax.
 
 Rows of several observations may stand one behind the other: only attention knows whose they are (engine/batch.py).
 
@@ -31,12 +31,12 @@ from turbopi.quantization.fp8 import Matrix, input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]
 Stream = tuple[Tensor, Tensor | None, Tensor | None]  # residual stream, what is to be added to it, times which gate
-# a layer's number and its queries [tokens * n, K], of the expert its product q|k|v [T, (n + 2) * K] -> [tokens, n * K]
+# a layer's number and its queries [tokens * n, K], of the expert q|k|v [T, (n + 2) * K] -> [tokens, n * K]
 Attend = Callable[..., Tensor]
 Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its keys and values go, each [tokens, K]
 
 HEAD_LAYERS = 3  # of vision: what they take is about as long as the host takes to launch the other 24
-# Of the prefix, which go through the products and norms between two attentions together. The activations of more don't
+# Of the prefix, which go through the matmuls and norms between two attentions together. The activations of more don't
 # stay in an H200's L2 cache from one operation to the next: in two chunks 8,960 rows take 1.4 ms less (bfloat16).
 MOST_ROWS = 5120
 
@@ -49,10 +49,10 @@ def vision_tokens(
     out: Tensor,
     head_ends: Callable[[], None] = lambda: None,
 ) -> None:
-    """Pictures -> language-model tokens, into `out` [V * 256, D].
+    """Images -> language-model tokens, into `out` [V * 256, D].
 
-    parts      each brings some of the pictures, (uint8|float32)[pictures, 224, 224, 3], when the head of those before
-               has ended. A head is patch embedding and the first layers; the others are of all pictures together
+    parts      each brings some of the images, (uint8|float32)[images, 224, 224, 3], when the head of those before
+               has ended. A head is patch embedding and the first layers; the others are of all images together
     head_ends  is called behind each head: see `engine.graph.HEAD`
     """
     v, several, vision = config.vision, len(parts) > 1, ops.vision or VisionByOps(ops)
@@ -108,7 +108,7 @@ class VisionByOps:
 
 
 def _added(ops: Ops, stream: Tensor | None, x: Tensor, *affine: Any) -> Any:
-    """Add a product to the residual stream in place, if that may be written over (not None) and the operations say that
+    """Add a matmul to the residual stream in place, if that may be written over (not None) and the operations say that
     it is faster. Returns what the next norm is still to add.
     """
     if stream is not None and ops.add_linear is not None and ops.add_linear(stream, x, *affine):

@@ -21,7 +21,7 @@ import torch
 from turbopi.kernels.nvrtc import capturing
 from turbopi.models.pi0.exact import exact_float32
 
-Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
+Mark = Callable[[str], None]  # is called with each stage at its end, or with `HEAD`
 HEAD = "head"  # the mark that cuts a sequence: what is before it is a graph of its own, launched first
 
 CAPTURING = threading.RLock()  # of the process: policies on other devices, too
@@ -45,7 +45,7 @@ def building(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Without Python's garbage collector. It may run at any line, and destroying a graph or an event that was let go
+    """Without Python's garbage collector. It may run at any line, and destroying a graph or an event that was freed
     earlier breaks the capture of the thread in which it happens.
     """
     enabled = gc.isenabled()

@@ -6,9 +6,8 @@ is left up to the call's fixed number of rows is padding, which sees itself alon
 Shapes: B observations of the call, R rows, n query heads.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -19,7 +18,7 @@ TILE = 64  # query rows of a tile of packed attention; rows of all heads of a to
 class Packed:
     """Where rows come from and which of them see each other, as `engine.batch` sends it to the device."""
 
-    source: np.ndarray  # int64[R]  a picture's token, or -1 - id of a prompt's
+    source: np.ndarray  # int64[R]  an image's token, or -1 - id of a prompt's
     positions: np.ndarray  # int64[R]  in its own observation
     segments: np.ndarray  # int32[2, B + 1]  first row and number of rows of each observation; the last one is padding
     tiles: np.ndarray  # int32[most_tiles, 4]  see `kernels.interface.Segments`
@@ -31,25 +30,25 @@ def most_tiles(rows: int, batch: int, heads: int) -> int:
 
 
 def pack_rows(
-    cameras: Sequence[int], tokens: Sequence[np.ndarray], *, batch: int, rows: int, per_picture: int, heads: int
+    cameras: Sequence[int], tokens: Sequence[np.ndarray], *, batch: int, rows: int, per_image: int, heads: int
 ) -> Packed:
-    """Pack observations with so many pictures, in the order in which the pictures come, and prompts int64[tokens].
+    """Pack observations with so many images, in the order in which the images come, and prompts int64[tokens].
 
     Fewer observations than `batch` are followed by empty ones.
     """
     source = np.full(rows, -1, np.int64)  # padding is token 0
     positions = np.zeros(rows, np.int64)
     segments = np.zeros((2, batch + 1), np.int32)
-    at = picture_row = 0
+    at = image_row = 0
     for i, (count, prompt) in enumerate(zip(cameras, tokens, strict=True)):
-        seen = count * per_picture
+        seen = count * per_image
         length = seen + len(prompt)
         assert at + length <= rows, f"{at + length} rows don't fit {rows}"
-        source[at : at + seen] = np.arange(picture_row, picture_row + seen)
+        source[at : at + seen] = np.arange(image_row, image_row + seen)
         source[at + seen : at + length] = -1 - prompt
         positions[at : at + length] = np.arange(length)
         segments[:, i] = at, length
-        at, picture_row = at + length, picture_row + seen
+        at, image_row = at + length, image_row + seen
     segments[0, len(cameras) :] = at
     segments[:, batch] = at, rows - at
     return Packed(source, positions, segments, _tiles(segments, rows, heads))
@@ -65,24 +64,3 @@ def _tiles(segments: np.ndarray, rows: int, heads: int) -> np.ndarray:
         here[:, 0], here[:, 1], here[:, 2], here[:, 3] = firsts, (start + length) * heads, start, length
         at += len(firsts) + len(firsts) % 2
     return tiles
-
-
-def split(count: int, costs: Mapping[int, float]) -> list[int]:
-    """The calls, largest first, that together hold `count` observations at the least cost.
-
-    costs  by the number of observations that a call holds, 1 among them: how long it takes, in any unit
-    """
-    assert count >= 1 and 1 in costs, (count, costs)
-    return list(_split(count, tuple(costs.items())))
-
-
-@lru_cache(maxsize=256)  # a call waits for it before it sends its pictures
-def _split(count: int, costs: tuple[tuple[int, float], ...]) -> tuple[int, ...]:
-    best: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
-    for wanted in range(1, count + 1):
-        options = []
-        for bucket, own in costs:
-            cost, others = best[max(wanted - bucket, 0)]
-            options.append((cost + own, tuple(sorted((*others, bucket), reverse=True))))
-        best.append(min(options, key=lambda option: (round(option[0], 6), len(option[1]))))
-    return best[count][1]

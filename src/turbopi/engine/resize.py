@@ -1,4 +1,4 @@
-"""Cameras' pictures to the vision tower's size on the device, to the last bit as `preprocess.images` does it on a CPU.
+"""Cameras' images to the vision tower's size on the device, to the last bit as `preprocess.images` does it on a CPU.
 
 Sources: Pillow's `Resample.c` (precompute_coeffs, normalize_coeffs_8bpc), PyTorch's `UpSampleKernel.cpp`.
 """
@@ -14,11 +14,11 @@ from turbopi.config import ImageResize
 from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
 from turbopi.preprocess.images import RESIZES, copy_picture, placement
 
-MOST_SIZES = 16  # of pictures whose weights are kept
+MOST_SIZES = 16  # of images whose weights are cached
 
 
 class Resizer:
-    """What `Ops.resize_pictures` needs of pictures of any size: their bytes on the device, and `table`."""
+    """What `Ops.resize_pictures` needs of images of any size: their bytes on the device, and `table`."""
 
     def __init__(self, images: Tensor) -> None:
         self._images = images
@@ -29,27 +29,27 @@ class Resizer:
         self._staged: list[tuple[Tensor, Tensor] | None] = [None] * len(images)  # bytes on the host and on the device
         self._taps: OrderedDict[tuple[int, int, bool], tuple[Taps, Taps, int, int]] = OrderedDict()  # see `_place`
 
-    def upload(self, pictures: Sequence[np.ndarray | None], resize: ImageResize) -> None:
-        """Send pictures uint8[h, w, 3], without waiting; None: what `images` holds is kept. All may change afterwards.
+    def upload(self, images: Sequence[np.ndarray | None], resize: ImageResize) -> None:
+        """Send images uint8[h, w, 3], without waiting; None: `images` stays as it is. All may change afterwards.
 
-        Raises ObservationError for a picture that is too narrow.
+        Raises ObservationError for an image that is too narrow.
         """
         rows = np.zeros_like(self._rows)
-        for camera, picture in enumerate(pictures):
-            if picture is not None:
-                rows[camera] = self._send(camera, picture, RESIZES[resize].low)
+        for camera, image in enumerate(images):
+            if image is not None:
+                rows[camera] = self._send(camera, image, RESIZES[resize].low)
         if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
             self._rows[:] = rows
             self.table.copy_(self._host, non_blocking=True)
 
-    def _send(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
+    def _send(self, camera: int, image: np.ndarray, low: float) -> tuple[int, ...]:
         """A row of the table."""
-        rows, columns, top, left = self._place(picture.shape[0], picture.shape[1])
-        host, device = self._stage(camera, picture.size)
-        copy_picture(picture, host.numpy().reshape(picture.shape))
+        rows, columns, top, left = self._place(image.shape[0], image.shape[1])
+        host, device = self._stage(camera, image.size)
+        copy_picture(image, host.numpy().reshape(image.shape))
         device.copy_(host, non_blocking=True)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
-        sizes = (picture.shape[1], picture.shape[0], columns.weights.shape[1], rows.weights.shape[1])
+        sizes = (image.shape[1], image.shape[0], columns.weights.shape[1], rows.weights.shape[1])
         filled = (len(rows.first), len(columns.first))
         return device.data_ptr(), *(one.data_ptr() for one in taps), *sizes, top, left, *filled, int(low)
 
@@ -62,7 +62,7 @@ class Resizer:
         return host[:size], device[:size]
 
     def _place(self, height: int, width: int) -> tuple[Taps, Taps, int, int]:
-        """Taps of rows and columns, and where the picture begins. Those used last are kept, at least a call's own."""
+        """Taps of rows and columns, and where the image begins. Those used last are cached, at least a call's own."""
         key = (height, width, self._images.dtype == torch.uint8)
         if key not in self._taps:
             rows, columns = placement((height, width, 3), tuple(self._images.shape[1:]))
@@ -84,7 +84,7 @@ def taps_of(had: int, wanted: slice, pillow: bool) -> Taps:
 def pillow_taps(had: int, wanted: int) -> tuple[np.ndarray, np.ndarray]:
     """Of an axis: int32[wanted] the first number that counts, int32[wanted, taps] weights in units of 2^-22.
 
-    A triangle whose half is a number of the result wide, or one of the picture if that is more.
+    A triangle whose half is a number of the result wide, or one of the image if that is more.
     """
     scale = had / wanted
     support = max(scale, 1.0)

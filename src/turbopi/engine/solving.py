@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.graph_cache import Loop
+from turbopi.engine.loops import SolverLoop
 from turbopi.kernels.interface import Denoiser, TokenInputs
 from turbopi.models.pi0.solvers import Integration
 
@@ -23,7 +23,7 @@ MakeDenoiser = Callable[[CallShape, Tensor | None], Denoiser | None]
 
 @dataclass(frozen=True)
 class Solving:
-    """A `Denoiser` of a solver's loop; `launches` has one-step kernels, with what they are told of tokens."""
+    """A `Denoiser` of a solver's loop; `launches` has one-step kernels, and their inputs by token."""
 
     integration: Integration
     launches: Sequence[tuple[Denoiser, tuple[TokenInputs, ...]]]
@@ -41,24 +41,9 @@ class Solving:
     ) -> None:
         assert tokens is None, "a solver's loop has one time for all actions"
         x_t[0] = noise
-        for k, (kernel, told) in enumerate(self.launches):
-            kernel.launch(x_t[k], cache_k, cache_v, length, self.unused, v_t[k : k + 1], *told)
+        for k, (kernel, by_token) in enumerate(self.launches):
+            kernel.launch(x_t[k], cache_k, cache_v, length, self.unused, v_t[k : k + 1], *by_token)
             x_t[k + 1] = self.integration.next_x(k, x_t, v_t)
-
-
-def evaluation_loops(loop: Loop) -> set[Loop]:
-    """The loops of one step that kernels of a solver's loop may be made for, as `solving` names them."""
-    if loop.integration is None:
-        return set()
-    return {_by_token(loop), *(_at(loop, t) for t in loop.times)}
-
-
-def _by_token(loop: Loop) -> Loop:
-    return Loop(1, loop.horizon, "tokens", loop.times)
-
-
-def _at(loop: Loop, t: float) -> Loop:
-    return Loop(1, loop.horizon, times=(t,))
 
 
 def solving(
@@ -72,33 +57,34 @@ def solving(
 ) -> Denoiser | None:
     """The denoiser of a solver's loop; None where `make` makes none: then operations do it.
 
-    table  float32[N, …]: the modulation at each evaluation's time, as the loop has them; None: there is none
+    table  float32[N, …]: the modulation at each evaluation's time; None: there is none
     """
     loop = shape.loop
     launches: list[tuple[Denoiser, tuple[TokenInputs, ...]]] = []
-    assert loop.integration is not None
+    assert isinstance(loop, SolverLoop), loop
+    at_any_time, *one_by_one = loop.evaluations
     if by_token:
-        kernel = make(replace(shape, loop=_by_token(loop)), table)
+        kernel = make(replace(shape, loop=at_any_time), table)
         if kernel is None:
             return None
-        launches = [(kernel, (_told(loop, k, config, device),)) for k in range(loop.steps)]
+        launches = [(kernel, (_token_inputs(loop, k, config, device),)) for k in range(loop.steps)]
     else:
-        for k, t in enumerate(loop.times):
-            kernel = make(replace(shape, loop=_at(loop, t)), None if table is None else table[k : k + 1])
+        for k, one in enumerate(one_by_one):
+            kernel = make(replace(shape, loop=one), None if table is None else table[k : k + 1])
             if kernel is None:
                 return None
             launches.append((kernel, ()))
     return Solving(loop.integration, launches, torch.empty(2, loop.horizon, config.action_dim, device=device))
 
 
-def _told(loop: Loop, k: int, config: ModelConfig, device: torch.device) -> TokenInputs:
+def _token_inputs(loop: SolverLoop, k: int, config: ModelConfig, device: torch.device) -> TokenInputs:
     """All actions at the time of evaluation k, which is row k of the table; nothing is moved, held or pulled."""
     grid = (1, loop.horizon)
     nothing = torch.zeros(grid, device=device)
     return TokenInputs(
         rows=torch.full(grid, k, dtype=torch.int32, device=device),
         steps=nothing,
-        times=torch.full(grid, loop.times[k], device=device),
+        times=torch.full(grid, loop.integration.evaluated[k], device=device),
         target=torch.zeros(loop.horizon, config.action_dim, device=device),
         gain=nothing,
     )

@@ -25,7 +25,7 @@ def is_conditioning(config: ModelConfig, name: str) -> bool:
     return ".dense." in name or (family_of(config).modulated and name.startswith("time_mlp_"))
 
 
-class PackingRoom:
+class WeightPlacement:
     """To be given to `Checkpoint.load` for `engine.weights.pack`.
 
     device   where tensors lie, and where random ones are made
@@ -40,7 +40,7 @@ class PackingRoom:
     def __call__(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """An uninitialised tensor for a parameter by its canonical name.
 
-        The room keeps nothing of a joined matrix once all its parts are given away, so packing can free it.
+        Nothing here refers to a joined matrix once all its parts are given away, so packing can free it.
         """
         device, names = HOST if self._on_host(name) else self.device, joined_with(name)
         if names is None:

@@ -1,8 +1,8 @@
 """A checkpoint's tensors as the engine wants them: matrices that share an input are packed into one, layer by layer.
 
 Packing takes tensors out of the state as it goes, so that the device never holds more than one layer twice; and if the
-state is the host's, no more than one layer as the checkpoint has it. Of a state that was read to a `PackingRoom`
-nothing is held twice.
+state is the host's, no more than one layer as the checkpoint has it. Of a state that was read to a `WeightPlacement`
+nothing is there twice.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,8 +1,8 @@
 """The engine in as few of PyTorch's own kernels as it can be said in: for CUDA graphs without a compiler.
 
-A small kernel takes two microseconds there, or four if its operands differ in dtype. So products keep their float32
-sums, all up to the next product is computed in float32, and products start from what is to be added to them: residual,
-mask, or what the shift of an adaRMS becomes in the product behind it.
+A small kernel takes two microseconds there, or four if its operands differ in dtype. So matmuls keep their float32
+sums, all up to the next matmul is computed in float32, and matmuls start from what is to be added to them: residual,
+mask, or what the shift of an adaRMS becomes in the matmul behind it.
 
 What is computed, and shapes: `engine.forward`, `kernels.plain`. Vision and Pi0's suffix stay `PLAIN`, but for vision's
 GELU.
@@ -25,7 +25,7 @@ from turbopi.kernels.plain import PLAIN
 FEW = 64  # rows whose GeGLU is launches, not bytes
 
 
-def product(a: Tensor, weight: Tensor, onto: Tensor | None = None, alpha: float = 1.0) -> Tensor:
+def matmul(a: Tensor, weight: Tensor, onto: Tensor | None = None, alpha: float = 1.0) -> Tensor:
     """a @ weightᵀ in float32, or `onto` with that times alpha added in place."""
     if onto is None:
         return plain.matmul_f32(a, weight.t())
@@ -92,12 +92,12 @@ def layer_onto(
     """
 
     def add(y: Tensor, weight: Tensor, gate: Tensor | None) -> None:
-        product(y, weight, x) if gate is None else x.addcmul_(product(y, weight), gate)
+        matmul(y, weight, x) if gate is None else x.addcmul_(matmul(y, weight), gate)
 
     n = len(x)
     normed = F.rms_norm(x, x.shape[-1:], norms[0], eps).to(k.dtype)
-    q = rope_split(product(normed, layer.qkv, qkv), rope, k[-n:], v[-n:])
-    probabilities = product(q, k, logits, q.shape[1] ** -0.5).softmax(-1).to(v.dtype)
+    q = rope_split(matmul(normed, layer.qkv, qkv), rope, k[-n:], v[-n:])
+    probabilities = matmul(q, k, logits, q.shape[1] ** -0.5).softmax(-1).to(v.dtype)
     add((probabilities @ v).view(n, -1), layer.out, gates[0])
     normed = F.rms_norm(x, x.shape[-1:], norms[1], eps).to(k.dtype)
     add(linear_geglu(normed, layer.gate_up, gate_up), layer.down, gates[1])
@@ -128,12 +128,12 @@ def prefix_cache(
         logits = hidden.repeat(slots * g.num_heads, 1)
         layer_onto(x, layer, (layer.norm1, layer.norm2), eps, turning, k[i], v[i], logits)
     normed = F.rms_norm(x, x.shape[-1:], layers[-1].norm1, eps).to(k.dtype)
-    rope_split(product(normed, layers[-1].qkv[-2 * g.head_dim :]), turning, k[-1], v[-1])
+    rope_split(matmul(normed, layers[-1].qkv[-2 * g.head_dim :]), turning, k[-1], v[-1])
 
 
 @dataclass(frozen=True)
 class Denoiser:
-    """A `Denoiser` for Pi0.5, any horizon, one time a step; what an adaRMS's shift becomes in a product is constant."""
+    """A `Denoiser` for Pi0.5, any horizon, one time a step; what an adaRMS's shift becomes in a matmul is constant."""
 
     config: ModelConfig
     weights: Weights
@@ -171,7 +171,7 @@ class Denoiser:
         rope, hidden = factors(cos[positions], sin[positions], g.num_heads), mask(length, rows - horizon, rows)
         x_t[0] = noise
         for step, table in enumerate(self.table):
-            # whole: elementwise kernels are fastest so, and products start from them
+            # whole: elementwise kernels are fastest so, and matmuls start from them
             gates = table[:-1, 2, None].expand(-1, horizon, -1).contiguous()
             logits = hidden.expand(g.depth, horizon * g.num_heads, -1).contiguous()
             qkv = self.qkv[step, :, None].expand(-1, horizon, -1).contiguous()

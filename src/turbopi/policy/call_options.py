@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from turbopi.config import LIMITS, GridName, PolicyConfig, Solver, TimeGrid
-from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, Loop, fit
+from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, fit
+from turbopi.engine.loops import EulerLoop
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.solvers import (
     Integration,
@@ -141,7 +142,7 @@ def several(what: str, given: Numbers, default: Sequence[int], check: Callable[[
 def warm_loops(steps: Sequence[int], horizons: Sequence[int]) -> list[tuple[int, int]]:
     """All pairs of steps and horizon, for a warm-up. Raises ConfigError if there are more than are kept."""
     loops = [(n, horizon) for n in steps for horizon in horizons]
-    if not fit(Loop(*loop) for loop in loops):
+    if not fit(EulerLoop(*loop) for loop in loops):
         raise ConfigError(
             f"warm-up was given {len(loops)} pairs of steps and horizon, {sum(n for n, _ in loops)} steps together; "
             f"backends keep graphs of {MOST_LOOPS} pairs and {MOST_STEPS} steps, so leave some out"

@@ -8,7 +8,7 @@ import numpy as np
 
 from turbopi.backends import Backend
 from turbopi.config import ModelConfig, PolicyConfig
-from turbopi.engine.conditioned import batch_form
+from turbopi.engine.loops import batch_form
 from turbopi.models.pi0.conditioning import (
     Conditioning,
     Conditionings,

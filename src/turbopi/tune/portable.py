@@ -143,7 +143,7 @@ class PackedAttention(PrefixAttention):
         self.each = one.rows // one.batch
         prompts = [np.zeros(self.each, np.int64)] * one.batch
         packed = pack_rows(
-            [0] * one.batch, prompts, batch=one.batch, rows=one.rows, per_picture=1, heads=self.heads
+            [0] * one.batch, prompts, batch=one.batch, rows=one.rows, per_image=1, heads=self.heads
         )  # rows are rows here: of pictures or prompts
         starts, lengths = (torch.from_numpy(row.copy()).to(self.device) for row in packed.segments)
         self.segments = Segments(starts, lengths, torch.from_numpy(packed.tiles).to(self.device))

@@ -11,7 +11,7 @@ from typing import Literal
 from turbopi.config import ModelConfig
 from turbopi.engine.call import places_of_parts
 from turbopi.engine.forward import HEAD_LAYERS, row_chunks
-from turbopi.engine.runner import BUCKET, bucket
+from turbopi.engine.plan import BUCKET, bucket
 from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
 from turbopi.models import family_of

@@ -25,9 +25,10 @@ from turbopi.backends.tensorrt.call import EngineCall
 from turbopi.backends.tensorrt.engines import ModelEngines, for_this_gpu, without_engine_weights
 from turbopi.backends.tensorrt.networks import Fp8Scales
 from turbopi.backends.tensorrt.parts import SLOTS, EngineShape, fingerprint
-from turbopi.engine.cold_call import not_warm
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.graph_cache import Loop, RecentLoops
+from turbopi.engine.graph_cache import LoopCache
+from turbopi.engine.loops import EulerLoop, Loop
+from turbopi.engine.plan import cold_call
 from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.models.observation import Observation
@@ -83,7 +84,7 @@ class TensorRTBackend(Backend):
         self._engines = self._make_engines(self._weights)
         self._sealed, self._missed = False, 0
         self._shapes: list[EngineShape] = []  # whose engines are loaded
-        self._recent, self._warming = RecentLoops(self._forget), False
+        self._recent, self._warming = LoopCache(self._forget), False
         self._tables: dict[int, Tensor | None] = {}
         self._calls: dict[CallKey, EngineCall] = {}
         self._graphs: dict[tuple[CallKey, str], Graph] = {}
@@ -242,7 +243,7 @@ class TensorRTBackend(Backend):
                 f"H={horizon}. Build them (`turbopi build --cameras {cameras} --prompt-tokens {tokens}`) and start anew"
             )
         if self.strict and not self._warming:
-            raise not_warm(self.name, f"engines for {cameras} cameras", map(str, self._shapes), cameras=cameras)
+            raise cold_call(self.name, f"engines for {cameras} cameras", map(str, self._shapes), cameras=cameras)
         cached = [s for s in self._engines.cached_shapes(cameras, horizon) if s.prompt_slots >= tokens]
         longest = -(-self.config.max_prompt_tokens // SLOTS) * SLOTS
         shape = cached[0] if cached else EngineShape(cameras, longest, horizon)
@@ -262,10 +263,10 @@ class TensorRTBackend(Backend):
         if (key, part) not in self._graphs:
             if self.strict and not self._warming:
                 warm = (f"{k.shape}, {k.num_steps} steps" for k, _ in self._graphs)
-                raise not_warm(self.name, f"{key.shape}, {key.num_steps} steps", warm, steps=key.num_steps)
+                raise cold_call(self.name, f"{key.shape}, {key.num_steps} steps", warm, steps=key.num_steps)
             start = time.perf_counter()
             with building(self.device):
-                self._recent.use(Loop(key.num_steps, key.shape.horizon))
+                self._recent.use(EulerLoop(key.num_steps, key.shape.horizon))
                 call = self._call(key)
                 run = {"call": call.run, "encode": call.encode, "denoise": call.denoise}[part]
                 before = call.parts.calls()
@@ -273,13 +274,13 @@ class TensorRTBackend(Backend):
             self._check_coverage(call, part, before)
             logger.info("captured %s of %s in %.2f s", part, key, time.perf_counter() - start)
         else:
-            self._recent.use(Loop(key.num_steps, key.shape.horizon))
+            self._recent.use(EulerLoop(key.num_steps, key.shape.horizon))
         return self._graphs[key, part]
 
     def _forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone."""
         self._synchronize()  # one may still run whose call was interrupted
-        gone = {key for key in self._calls if Loop(key.num_steps, key.shape.horizon) == loop}
+        gone = {key for key in self._calls if EulerLoop(key.num_steps, key.shape.horizon) == loop}
         for kept in [key for key in self._graphs if key[0] in gone]:
             del self._graphs[kept]
         for key in gone:

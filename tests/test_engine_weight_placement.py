@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import PRESETS
-from turbopi.engine.weight_placement import GATE_UP, PackingRoom, is_conditioning, join, joined_with
+from turbopi.engine.weight_placement import GATE_UP, WeightPlacement, is_conditioning, join, joined_with
 from turbopi.engine.weights import Weights, pack
 from turbopi.models.pi0.reference import parameter_shapes
 
@@ -23,8 +23,8 @@ def nothing(name: str) -> bool:
 
 
 def packed(on_host: Callable[[str], bool] = nothing) -> tuple[Weights, dict[str, Tensor]]:
-    """Of a room, and the state as it was read."""
-    state = random_checkpoint(CONFIG).load(PackingRoom(CONFIG.model, CPU, on_host), "bf16").state
+    """Of a placement, and the state as it was read."""
+    state = random_checkpoint(CONFIG).load(WeightPlacement(CONFIG.model, CPU, on_host), "bf16").state
     return pack(CONFIG.model, dict(state)), state
 
 
@@ -55,19 +55,19 @@ def test_what_is_joined_is_where_it_was_read_to() -> None:
 
 
 def test_tensors_lie_where_the_room_has_them() -> None:
-    room = PackingRoom(CONFIG.model, META, lambda name: is_conditioning(CONFIG.model, name))
+    placement = WeightPlacement(CONFIG.model, META, lambda name: is_conditioning(CONFIG.model, name))
     shapes = {"time_mlp_in.weight": CPU, "expert.layers.0.input_layernorm.dense.weight": CPU, "projector.weight": META}
     for name, device in shapes.items():
-        assert room(name, (2, 3), torch.float32).device == device
+        assert placement(name, (2, 3), torch.float32).device == device
     pi0 = replace(CONFIG.model, kind="pi0")
     assert not is_conditioning(pi0, "time_mlp_in.weight"), "which of Pi0 is a part of every step"
 
 
 def test_a_room_keeps_nothing_of_what_it_gave_away() -> None:
     """What packing rounds or drops shall be freed layer by layer, not when all is packed."""
-    room, shapes = PackingRoom(CONFIG.model, CPU, nothing), parameter_shapes(CONFIG.model)
+    placement, shapes = WeightPlacement(CONFIG.model, CPU, nothing), parameter_shapes(CONFIG.model)
     names = [f"vlm.layers.1.mlp.{part}.weight" for part in GATE_UP]
-    stores = [[room(name, shapes[name], torch.bfloat16).untyped_storage() for name in names] for _ in range(2)]
+    stores = [[placement(name, shapes[name], torch.bfloat16).untyped_storage() for name in names] for _ in range(2)]
     (gate, up), (other_gate, other_up) = ([one.data_ptr() for one in some] for some in stores)
     assert gate == up != other_gate == other_up
 
@@ -84,7 +84,7 @@ def test_a_damaged_number_is_found_wherever_it_lies(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(checkpoint.source, "pieces", damaged)
     with pytest.raises(Exception, match=r"vlm\.layers\.1\.self_attn\.k_proj\.weight"):
-        checkpoint.load(PackingRoom(CONFIG.model, CPU, nothing), "bf16")
+        checkpoint.load(WeightPlacement(CONFIG.model, CPU, nothing), "bf16")
 
 
 @pytest.mark.parametrize(
