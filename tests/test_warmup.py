@@ -312,7 +312,7 @@ def test_a_robot_that_doesnt_say_has_as_many_cameras_as_its_example() -> None:
     policy._pipeline.robot = dataclasses.replace(policy._pipeline.robot)  # type: ignore[type-var]
     object.__setattr__(policy._pipeline.robot, "camera_counts", None)
     policy.warmup()
-    assert {key[0].cameras for key in captures(policy)} == {3}
+    assert {key.images for key in captures(policy)} == {3}
 
 
 def test_backends_warm_up_by_themselves_for_one_observation() -> None:
