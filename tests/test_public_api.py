@@ -51,4 +51,4 @@ def test_without_pytorch_a_policy_is_refused_in_words() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
     last = done.stderr.splitlines()[-1]
     assert last.startswith("ImportError: turbopi.UnifiedPolicy needs PyTorch, which isn't installed: "), done.stderr
-    assert last.endswith("turbopi.realtime.client alone, without PyTorch (docs/real_time.md)")
+    assert last.endswith("turbopi.realtime alone, without PyTorch (docs/real_time.md)")

@@ -79,7 +79,7 @@ def __getattr__(name: str) -> object:
     if name == "errors":
         return importlib.import_module("turbopi.support.errors")
     try:
-        module = importlib.import_module(f"turbopi.{_MODULES.get(name, 'errors')}")
+        return getattr(importlib.import_module(f"turbopi.{_MODULES.get(name, 'errors')}"), name)
     except ModuleNotFoundError as missing:
         if missing.name != "torch":
             raise
@@ -88,7 +88,6 @@ def __getattr__(name: str) -> object:
             "robot's computer that calls a server needs turbopi.realtime alone, without PyTorch (docs/real_time.md)",
             name="torch",
         ) from missing
-    return getattr(module, name)
 
 
 # Names of 0.1's modules, found for one version more. `turbopi.errors` stays a public name.
