@@ -1,6 +1,6 @@
 """From what a robot saw to FP8: record → calibrate → verify → serve.
 
-    python examples/fp8_from_recordings.py                     # the small policy that ships with Turbo-Pi, its pictures
+    python examples/fp8_from_recordings.py                     # the small policy that ships with Turbo-Pi, its images
     python examples/fp8_from_recordings.py --backend fused     # on an H100 or H200, which have FP8
 
 FP8 needs scales that are measured on real observations. `emulated_fp8` computes its roundings on any machine, slowly.

@@ -35,8 +35,8 @@ class FakeSO101:
     def connect(self) -> None: ...
 
     def get_observation(self) -> dict[str, Any]:
-        pictures = {name: np.full((480, 640, 3), 128, np.uint8) for name in ("front", "wrist")}
-        return {**self._positions, **pictures}
+        camera_images = {name: np.full((480, 640, 3), 128, np.uint8) for name in ("front", "wrist")}
+        return {**self._positions, **camera_images}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self._positions.update(action)

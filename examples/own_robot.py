@@ -54,15 +54,17 @@ class DegreeArm(Robot):
 
 def main() -> None:
     checkpoint = random_checkpoint("pi05_tiny")  # your folder's path in place of it
-    picture = np.zeros((480, 640, 3), np.uint8)
+    camera_image = np.zeros((480, 640, 3), np.uint8)
     joints = np.array([10.0, -20.0, 30.0, 0.0, 45.0, 90.0])
 
     file = UnifiedPolicy(checkpoint, robot=str(Path(__file__).with_name("my_arm.json")))
-    seen = {"front_camera": picture, "wrist_camera": picture, "joint_position": np.radians(joints)}
+    seen = {"front_camera": camera_image, "wrist_camera": camera_image, "joint_position": np.radians(joints)}
     print("my_arm.json:", file.infer({**seen, "gripper_position": 0.5}, seed=0)["actions"].shape)
 
     own = UnifiedPolicy(checkpoint, robot=DegreeArm())
-    print("DegreeArm:", own.infer({"camera": picture, "degrees": joints, "gripper": 128.0}, seed=0)["actions"].shape)
+    print(
+        "DegreeArm:", own.infer({"camera": camera_image, "degrees": joints, "gripper": 128.0}, seed=0)["actions"].shape
+    )
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--execution", default="async", help="a way to run of docs/real_time.md")
     parser.add_argument("--hz", type=float, default=20, help="control steps a second")
     parser.add_argument("--steps", type=int, default=100, help="control steps until it ends")
-    parser.add_argument("--age", type=float, default=5, metavar="S", help="oldest picture that may act; with a GPU: 1")
+    parser.add_argument("--age", type=float, default=5, metavar="S", help="oldest image that may act; with a GPU: 1")
     parser.add_argument(
         "--patience", type=float, default=120, metavar="S", help="seconds that the server may take to start"
     )
@@ -85,7 +85,7 @@ def main() -> None:
         try:
             tick = time.monotonic()
             for _ in range(options.steps):
-                if executor.wants_observation:  # the pictures of other steps wouldn't be used
+                if executor.wants_observation:  # the images of other steps wouldn't be used
                     executor.observe(arm.observe())
                 command = executor.next_action()  # never waits for the policy
                 if command.action is not None:

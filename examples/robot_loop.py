@@ -65,13 +65,13 @@ def main() -> None:
     policy, arm = connected(options.host, options.port, options.patience), Arm()
     print("connected to a policy for", policy.get_server_metadata()["robot"])
     for _ in range(options.chunks):
-        asked = time.monotonic()
+        requested = time.monotonic()
         try:
             answer = policy.infer(arm.observe())
         except RuntimeError as error:  # the server says why there are no actions
             arm.hold()
             raise SystemExit(f"no actions: {error}") from error
-        print(f"{len(answer['actions'])} actions after {1e3 * (time.monotonic() - asked):.0f} ms")
+        print(f"{len(answer['actions'])} actions after {1e3 * (time.monotonic() - requested):.0f} ms")
         for action in answer["actions"][:EXECUTED]:
             arm.move(action)
             time.sleep(1 / HZ)

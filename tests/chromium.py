@@ -31,7 +31,7 @@ class Page:
         self._connection = connection
         self._numbers = itertools.count(1)
         self.console: list[str] = []
-        self.requested: list[str] = []  # every URL that was asked for
+        self.requested: list[str] = []  # every URL that was requested
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
@@ -54,7 +54,7 @@ class Page:
         elif event == "Runtime.exceptionThrown":
             self.console.append(str(what["exceptionDetails"]))
         elif event == "Network.requestWillBeSent":
-            self.requested.append(what["request"]["url"][:200])  # pictures are in theirs
+            self.requested.append(what["request"]["url"][:200])  # images are in theirs
         elif event == "Network.webSocketCreated":
             self.requested.append(what["url"])
 
@@ -69,9 +69,9 @@ class Page:
 
     def until(self, expression: str) -> None:
         """Wait for a JavaScript expression to be true; one that throws isn't yet."""
-        asked = f"(() => {{ try {{ return Boolean({expression}); }} catch {{ return false; }} }})()"
+        condition = f"(() => {{ try {{ return Boolean({expression}); }} catch {{ return false; }} }})()"
         deadline = time.monotonic() + SECONDS
-        while not self.value(asked):
+        while not self.value(condition):
             assert time.monotonic() < deadline, f"{expression} isn't true. The console: {self.console}"
             time.sleep(0.1)
 

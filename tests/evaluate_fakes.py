@@ -24,7 +24,7 @@ HORIZON = 10
 
 
 class SeekingPolicy:
-    """Finds the goal in the picture and goes there: it solves every task of the reacher, if its pictures are current.
+    """Finds the goal in the image and goes there: it solves every task of the reacher, if its images are current.
 
     `trouble` maps a call's number (from 0) to what it does instead: "nan", or an exception to raise.
     """
@@ -61,13 +61,13 @@ class SeekingPolicy:
         return actions
 
 
-def find_goal(picture: np.ndarray) -> np.ndarray:
+def find_goal(camera_image: np.ndarray) -> np.ndarray:
     """The coloured dot's centre, in the reacher's coordinates; (0, 0) if there is none."""
-    spread = picture.max(axis=2).astype(int) - picture.min(axis=2)
+    spread = camera_image.max(axis=2).astype(int) - camera_image.min(axis=2)
     rows, columns = np.nonzero(spread > 80)
     if not len(rows):
         return np.zeros(2)
-    px = picture.shape[0]
+    px = camera_image.shape[0]
     return np.array([(columns.mean() + 0.5) / px * 2 - 1, 1 - (rows.mean() + 0.5) / px * 2]) * 1.1
 
 
@@ -154,7 +154,7 @@ def run(
     seeding: Any = "episode",
     **protocol: Any,
 ) -> Results:
-    """`evaluate` with small pictures; `policy` is a policy or a source."""
+    """`evaluate` with small images; `policy` is a policy or a source."""
     source: PolicySource = policy if hasattr(policy, "label") else LocalPolicy(policy)
     settings = SimSettings(seeding=seeding, camera_px=64, wait_steps=2)
     made = create(simulator)
@@ -179,7 +179,7 @@ def gathering(monkeypatch: "pytest.MonkeyPatch", folder: Path, workers: int) -> 
         read.extend(ready)
         return ready
 
-    def asked() -> int:
+    def requested() -> int:
         known = [*read, *wait(listened, 0.1)]
         return sum(one in known for one in listened)
 
@@ -187,4 +187,4 @@ def gathering(monkeypatch: "pytest.MonkeyPatch", folder: Path, workers: int) -> 
     monkeypatch.setenv("GATHER_FOLDER", str(folder))
     monkeypatch.setenv("GATHER_COUNT", str(workers))
     monkeypatch.setattr(connection, "wait", listening)
-    return asked
+    return requested

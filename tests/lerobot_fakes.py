@@ -107,4 +107,4 @@ def _features(described: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(*_: Any) -> None:
-    raise AssertionError("these tests' pictures have the model's size")
+    raise AssertionError("these tests' images have the model's size")

@@ -60,7 +60,7 @@ class GoldenCase:
     def differences(self, checkpoint: Path) -> dict[str, float]:
         """By name, the largest of all runs: nan where shapes differ or what must be equal isn't.
 
-        Largest absolute difference for pictures and state; relative root mean square for the rest.
+        Largest absolute difference for images and state; relative root mean square for the rest.
         """
         described = self.described
         inputs, expected = np.load(self.folder / "inputs.npz"), np.load(self.folder / "expected.npz")

@@ -8,6 +8,7 @@ import torch
 from conftest import golden_folder
 from torch import Tensor
 
+from turbopi.backends import Precision
 from turbopi.backends.base import LoadState
 from turbopi.backends.tensorrt.backend import TensorRTBackend
 from turbopi.backends.tensorrt.cache import EngineCache, Environment
@@ -21,7 +22,7 @@ from turbopi.support.errors import BackendError
 ENVIRONMENT = Environment("w" * 16, "tensorrt_rtx", "1.0", "A GPU", "9.0", "0.1.0", "code")
 
 
-class Twin:
+class Reference:
     """An engine's interface around its network in PyTorch."""
 
     def __init__(self, specification: Specification) -> None:
@@ -56,16 +57,16 @@ class FakeGraph:
         return dict.fromkeys(self._marks, 1.0)
 
 
-def twin_engines(
+def reference_engines(
     backend: TensorRTBackend, weights: Weights, folder: Path, built: list[str], **options: Any
 ) -> ModelEngines:
     def build(specification: Specification) -> bytes:
         built.append(specification.name)
         return specification.name.encode()
 
-    def load(specification: Specification, plan: bytes) -> Twin:
+    def load(specification: Specification, plan: bytes) -> Reference:
         assert plan == specification.name.encode()
-        return Twin(specification)
+        return Reference(specification)
 
     class Engines(ModelEngines):
         def release(self) -> None:
@@ -75,16 +76,16 @@ def twin_engines(
     return Engines(backend.config, weights, cache, build=build, load=load, **options)
 
 
-def on_twins(cls: type[TensorRTBackend], folder: Path, *, half: bool = False) -> type[TensorRTBackend]:
+def on_references(cls: type[TensorRTBackend], folder: Path, *, half: bool = False) -> type[TensorRTBackend]:
     """A backend class on the CPU; float32 throughout unless `half`."""
 
-    class OnTwins(cls):  # type: ignore[misc, valid-type]
+    class OnReferences(cls):  # type: ignore[misc, valid-type]
         built: list[str]
 
         def _make_engines(self, weights: Weights) -> ModelEngines:
             self.built = []
             dtype = "f16" if half else "f32"
-            return twin_engines(self, weights, folder, self.built, vision_dtype=dtype, scales=self._scales())
+            return reference_engines(self, weights, folder, self.built, vision_dtype=dtype, scales=self._scales())
 
         def _capture(self, run: Any, part: str) -> Any:
             return FakeGraph(run)
@@ -96,7 +97,7 @@ def on_twins(cls: type[TensorRTBackend], folder: Path, *, half: bool = False) ->
             encode.replay()
             return denoise.replay
 
-    return OnTwins
+    return OnReferences
 
 
 def golden_load(kind: Kind) -> LoadState:
@@ -106,5 +107,6 @@ def golden_load(kind: Kind) -> LoadState:
 
 def golden_backend(cls: type[TensorRTBackend], kind: Kind, folder: Path, *, half: bool = False) -> Any:
     config = golden_folder().checkpoint(kind).config.model
-    precision = "bf16" if half else "f32"
-    return on_twins(cls, folder, half=half)(config, golden_load(kind), device=torch.device("cpu"), precision=precision)  # type: ignore[arg-type]
+    precision: Precision = "bf16" if half else "f32"
+    backend = on_references(cls, folder, half=half)
+    return backend(config, golden_load(kind), device=torch.device("cpu"), precision=precision)

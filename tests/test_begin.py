@@ -65,18 +65,18 @@ class OnCpu(CudaGraphBackend):
     """`cuda_graph` without the graphs. `told` has what was launched, in order; "run" is vision."""
 
     def _make_ops(self) -> Ops:
-        self.told: list[str] = []
+        self.reported: list[str] = []
         return PLAIN
 
     def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
-        return Ran(run, after, self.told.append)
+        return Ran(run, after, self.reported.append)
 
 
 class Unrun(OnCpu):
     """Whose captures don't run what they capture, for tests of which there are."""
 
     def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
-        return Ran(run, after, self.told.append, at_once=False)
+        return Ran(run, after, self.reported.append, at_once=False)
 
 
 def on_cpu(kind: Kind = "pi05", cls: type[OnCpu] = OnCpu) -> OnCpu:
@@ -96,7 +96,7 @@ def policy(reference: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> Unified
 
     class Telling:
         def encode(self, text: str, *, add_bos: bool) -> Any:
-            policy.backend.told.append("tokenise")  # type: ignore[attr-defined]
+            policy.backend.reported.append("tokenise")  # type: ignore[attr-defined]
             if "unspeakable" in text:
                 raise ObservationError("no words for it")
             return encoder.encode(text, add_bos=add_bos)
@@ -108,10 +108,10 @@ def policy(reference: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> Unified
 def test_vision_is_launched_before_the_prompt_is_read(policy: UnifiedPolicy) -> None:
     observation = policy.example_observation()
     policy.infer(observation, seed=0)
-    told = policy.backend.told  # type: ignore[attr-defined]
-    told.clear()
+    reported = policy.backend.reported  # type: ignore[attr-defined]
+    reported.clear()
     policy.infer(observation, seed=0)
-    assert told == ["run", "tokenise", "answer"]
+    assert reported == ["run", "tokenise", "answer"]
 
 
 def test_actions_are_the_references(policy: UnifiedPolicy, reference: UnifiedPolicy) -> None:
@@ -149,11 +149,11 @@ def test_what_goes_wrong_behind_vision_leaves_the_next_call_right(
 ) -> None:
     good, other = policy.example_observation(0), policy.example_observation(1)
     expected = policy.infer(good, seed=0)["actions"]
-    policy.backend.told.clear()  # type: ignore[attr-defined]
+    policy.backend.reported.clear()  # type: ignore[attr-defined]
     with pytest.raises(ObservationError):
         policy.infer({**other, **wrong}, **arguments)
-    assert policy.backend.told[0] == "run"  # type: ignore[attr-defined]
-    assert "answer" not in policy.backend.told  # type: ignore[attr-defined]
+    assert policy.backend.reported[0] == "run"  # type: ignore[attr-defined]
+    assert "answer" not in policy.backend.reported  # type: ignore[attr-defined]
     np.testing.assert_array_equal(policy.infer(good, seed=0)["actions"], expected)
 
 
@@ -228,18 +228,21 @@ def test_one_observation_at_a_time() -> None:
 
 
 def test_one_batch_at_a_time() -> None:
-    """Else the first one's prompts would be answered by the second one's pictures."""
+    """Else the first one's prompts would be answered by the second one's images."""
     backend, made = on_cpu(), [made_up("pi05", 2, 5, seed) for seed in (0, 1)]
     rows, noise = [HostRow.of(one, 0) for one, _ in made], np.concatenate([noise.numpy() for _, noise in made])
-    pictures, rest = [row.images for row in rows], ([row.tokens for row in rows], np.stack([r.state for r in rows]))
-    actions = backend.begin_batch(pictures).finish(*rest, noise, 1).actions
-    first, second = backend.begin_batch(pictures[::-1]), backend.begin_batch(pictures)
+    camera_images, rest = (
+        [row.images for row in rows],
+        ([row.tokens for row in rows], np.stack([r.state for r in rows])),
+    )
+    actions = backend.begin_batch(camera_images).finish(*rest, noise, 1).actions
+    first, second = backend.begin_batch(camera_images[::-1]), backend.begin_batch(camera_images)
     with pytest.raises(BackendError, match="begun another"):
         first.finish(*rest, noise, 1)
     assert torch.equal(second.finish(*rest, noise, 1).actions, actions)
     with pytest.raises(BackendError, match="has finished this observation"):
         second.finish(*rest, noise, 1)
-    batch, alone = backend.begin_batch(pictures), backend.begin(pictures[0])
+    batch, alone = backend.begin_batch(camera_images), backend.begin(camera_images[0])
     with pytest.raises(BackendError, match="begun another"):
         batch.finish(*rest, noise, 1)
     torch.testing.assert_close(

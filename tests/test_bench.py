@@ -108,7 +108,7 @@ def test_every_observation_is_new_and_has_the_cameras_asked_for(policy: UnifiedP
 
 def test_pictures_have_the_size_asked_for(policy: UnifiedPolicy) -> None:
     observations = Observations(policy, Job(cameras=2, image_width=64, image_height=48))
-    assert {picture.shape for picture in next(observations)["images"].values()} == {(48, 64, 3)}
+    assert {camera_image.shape for camera_image in next(observations)["images"].values()} == {(48, 64, 3)}
     plan = BenchPlan(["pytorch"], ["f32"], image_sizes=[(64, 48), (224, 224)], steps=[1, 2])
     assert [str(job) for job in plan.jobs()] == [
         f"2 cameras{of}, 48 tokens, H=10, {steps} steps" for of in (" of 64x48", "") for steps in (1, 2)
@@ -301,17 +301,17 @@ def test_floors_are_shown_with_three_digits(bytes_per_second: float, flops_per_s
 
 def test_on_a_cpu_the_matrix_rate_is_of_weights_as_the_model_keeps_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """[outputs, inputs]: the other layout is twenty times slower in bfloat16 on CPUs without its instructions."""
-    asked: list[tuple[torch.Size, bool]] = []
+    requested: list[tuple[torch.Size, bool]] = []
     linear = torch.nn.functional.linear
 
     def seen(x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        asked.append((weight.shape, weight.is_contiguous()))
+        requested.append((weight.shape, weight.is_contiguous()))
         return linear(x, weight)
 
     monkeypatch.setattr(torch.nn.functional, "linear", seen)
     monkeypatch.setattr(machine_limits, "median_seconds", lambda run, device: 0.5 if run() is not None else 0.0)
     assert machine_limits._matmul_rate(CPU, torch.bfloat16, 16) == 2 * 16**3 / 0.5
-    assert asked == [((16, 16), True)]
+    assert requested == [((16, 16), True)]
 
 
 @pytest.mark.slow
@@ -428,8 +428,8 @@ def test_the_command_writes_a_complete_document(
     assert page == report(as_document(document, BenchDocument, "stdout"))
     assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page
     document["results"][-1]["backend_details"]["denoising_clock_mhz"] = {"H=10, 2 steps": 1795}
-    told = report(as_document(document, BenchDocument, "stdout"))
-    assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in told
+    reported = report(as_document(document, BenchDocument, "stdout"))
+    assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in reported
 
 
 @pytest.mark.slow
@@ -499,19 +499,19 @@ def test_a_backend_that_breaks_is_named_and_costs_no_other_result(monkeypatch: p
 def test_a_batch_is_one_call_with_observations_of_its_own(
     policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[list[str]] = []
+    requested: list[list[str]] = []
     forms: list[list[str]] = []
     together = policy.infer_batch
 
     def noted(observations: list[dict[str, Any]], **more: Any) -> list[dict[str, Any]]:
-        asked.append([one["prompt"] for one in observations])
+        requested.append([one["prompt"] for one in observations])
         forms.append([one.form for one in more["conditioning"] or []])
         return together(observations, **more)
 
     monkeypatch.setattr(policy, "infer_batch", noted)
     latency = measure_calls(policy, Job(cameras=1, prompt_tokens=3, steps=1, batch=3), 2)
-    assert latency["total"].calls == 2 and len(asked) == 5
-    assert all(len(prompts) == len(set(prompts)) == 3 for prompts in asked) and not any(forms)
+    assert latency["total"].calls == 2 and len(requested) == 5
+    assert all(len(prompts) == len(set(prompts)) == 3 for prompts in requested) and not any(forms)
     measure_calls(policy, Job(cameras=1, prompt_tokens=3, steps=1, batch=2, join="held"), 1)
     assert forms[-1] == ["tokens", "tokens"], "each joins a chunk"
 

@@ -256,8 +256,8 @@ def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     model, own = golden_model("pi05"), golden_calls(golden_cases()["b_third_masked"])
     settings = Settings({}, target=0.0, batch=1, methods=("percentile",))
     found = calibrate_model(model, own, own, 1, settings)
-    told = [warning for warning in found.report["warnings"] if "of vision.0.qkv saturate" in warning]
-    assert len(told) == 1 and 0.05 < found.sites["vision.0.qkv"].saturated < 0.15
+    reported = [warning for warning in found.report["warnings"] if "of vision.0.qkv saturate" in warning]
+    assert len(reported) == 1 and 0.05 < found.sites["vision.0.qkv"].saturated < 0.15
     assert any("of expert.0.down saturate" in warning for warning in found.report["warnings"])
     settings = dataclasses.replace(settings, methods=("headroom",))
     assert not [w for w in calibrate_model(model, own, own, 1, settings).report["warnings"] if "saturate" in w]

@@ -189,7 +189,7 @@ def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[s
             PRE,
             "normalizer_processor",
             {"norm_map": {"STATE": "QUANTILES", "VISUAL": "MEAN_STD"}},
-            "normalises pictures by MEAN_STD",
+            "normalises images by MEAN_STD",
         ),
         (PRE, "normalizer_processor", {"features": {}}, "features leave out observation.state.*needs q01 and q99"),
         (PRE, "normalizer_processor", {"normalize_observation_keys": ["a"]}, "features leave out observation.state"),

@@ -107,9 +107,9 @@ def settings_without_base(folder: Path) -> None:
 
 def test_a_base_that_isnt_here_is_asked_for(folder: Path) -> None:
     settings_without_base(folder)
-    with pytest.raises(CheckpointError, match="holds an adapter without its base model") as told:
+    with pytest.raises(CheckpointError, match="holds an adapter without its base model") as reported:
         open_checkpoint(folder)
-    message = str(told.value)
+    message = str(reported.value)
     assert "adapter_config.json names its base model 'lerobot/base', which is no folder here" in message
     assert "hf download lerobot/base --local-dir DIR" in message
     assert '{"base_model": "/path/to/it"}' in message

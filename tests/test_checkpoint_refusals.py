@@ -424,6 +424,6 @@ def test_an_index_names_files_of_its_own_folder_alone(tmp_path: Path, name: str)
     folder = torch_copy(tmp_path / "copy")
     (folder / "model.safetensors").rename(tmp_path / "other.safetensors")
     write_json(folder / "model.safetensors.index.json", {"weight_map": {"time_mlp_in.bias": name}})
-    with pytest.raises(CheckpointError, match=r"expected plain names of .safetensors files beside it") as told:
+    with pytest.raises(CheckpointError, match=r"expected plain names of .safetensors files beside it") as reported:
         open_checkpoint(folder)
-    assert name in str(told.value)
+    assert name in str(reported.value)

@@ -167,10 +167,10 @@ def test_a_file_that_is_not_what_an_option_wants_is_named(option: str, content: 
     else:
         file.write_bytes(content)
     observation = tmp_path / "observation.npz"
-    picture = np.zeros((8, 8, 3), np.uint8)
+    camera_image = np.zeros((8, 8, 3), np.uint8)
     seen: dict[str, Any] = {
-        "observation/image": picture,
-        "observation/wrist_image": picture,
+        "observation/image": camera_image,
+        "observation/wrist_image": camera_image,
         "observation/state": np.zeros(8),
     }
     np.savez(observation, prompt="x", **seen)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from cli_helpers import refusal, turbopi
 from conftest import golden_folder, golden_model
-from tensorrt_fakes import ENVIRONMENT, Twin
+from tensorrt_fakes import ENVIRONMENT, Reference
 
 from turbopi import backends
 from turbopi.backends.tensorrt import Library
@@ -36,7 +36,7 @@ def build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., dict
 
     def engines(library: Any, config: Any, weights: Any, hashed: str, device: Any, *, folder: Path, **more: Any) -> Any:
         cache = EngineCache(folder, dataclasses.replace(ENVIRONMENT, weights=hashed))
-        return ModelEngines(config, weights, cache, build=build_one, load=lambda one, plan: Twin(one), **more)
+        return ModelEngines(config, weights, cache, build=build_one, load=lambda one, plan: Reference(one), **more)
 
     monkeypatch.setattr("turbopi.backends.tensorrt.engines.for_this_gpu", engines)
     monkeypatch.setattr("turbopi.backends.tensorrt.library", lambda: Library("tensorrt_rtx", "1.0", None))
@@ -67,7 +67,7 @@ def test_fp8_engines_are_calibrated_on_real_pictures_and_the_scales_kept(
     build: Callable[..., dict[str, Any]],
 ) -> None:
     document = build("--precision", "fp8")
-    assert document["calibration"]["source"] == "LIBERO pictures that come with Turbo-Pi"
+    assert document["calibration"]["source"] == "LIBERO images that come with Turbo-Pi"
     assert document["calibration"]["observations"] > 1 and document["backend"] == "tensorrt_fp8"
     kept = Calibration.find(Path(document["folder"]))
     assert kept is not None and len(kept.scales) == 5

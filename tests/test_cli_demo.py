@@ -34,17 +34,17 @@ def test_the_frames_are_real_pictures_with_states_and_prompts() -> None:
     frames = shipped.load_frames()
     assert len(frames) >= 3
     for frame in frames:
-        for picture in (frame.base, frame.wrist):
-            assert picture.shape == (256, 256, 3)
-            assert picture.dtype == np.uint8
-            assert picture.std() > 10
+        for camera_image in (frame.base, frame.wrist):
+            assert camera_image.shape == (256, 256, 3)
+            assert camera_image.dtype == np.uint8
+            assert camera_image.std() > 10
         assert frame.state.shape == (8,)
         assert frame.prompt
     assert len({frame.base.tobytes() for frame in frames}) == len(frames)
 
 
 def test_missing_pictures_are_said_to_be_missing(tmp_path: Path) -> None:
-    with pytest.raises(TurboPiError, match=r"has no frames.json: the installation lacks the demo's pictures"):
+    with pytest.raises(TurboPiError, match=r"has no frames.json: the installation lacks the demo's images"):
         shipped.load_frames(tmp_path)
 
 
@@ -81,9 +81,9 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
         assert actions["actions"].dtype == np.float64
         np.testing.assert_allclose(actions["actions"][1], report["frames"][1]["actions"])
         assert not np.array_equal(actions["actions"], actions["oracle_actions"])
-    with Image.open(tmp_path / "report" / "demo.png") as picture:
-        assert picture.width > 1200
-        assert np.asarray(picture.convert("L")).std() > 20
+    with Image.open(tmp_path / "report" / "demo.png") as camera_image:
+        assert camera_image.width > 1200
+        assert np.asarray(camera_image.convert("L")).std() > 20
 
 
 @pytest.mark.slow
@@ -103,9 +103,9 @@ def test_episodes_that_are_asked_for_without_a_simulator_are_refused(tmp_path: P
     monkeypatch.setattr(LiberoSimulator, "check", missing)
     result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--episodes", 1)
     assert refusal(result) == "LIBERO isn't installed here", "before a policy is made"
-    told = turbopi("demo", "--frames", 1, "--steps", 1, "--report", tmp_path)
-    assert told.exit_code == 0, told.output
-    assert "The policy didn't act in the simulator: LIBERO isn't installed here" in " ".join(told.stdout.split())
+    reported = turbopi("demo", "--frames", 1, "--steps", 1, "--report", tmp_path)
+    assert reported.exit_code == 0, reported.output
+    assert "The policy didn't act in the simulator: LIBERO isn't installed here" in " ".join(reported.stdout.split())
 
 
 def swapped_cameras(self: PyTorchBackend, observation: Observation, noise: torch.Tensor, num_steps: int) -> Sample:
@@ -254,17 +254,17 @@ def test_every_action_dimension_is_drawn_once_with_a_unit(robot: str, dims: int)
 def test_the_real_time_demo_counts_what_it_played_and_says_it(tmp_path: Path) -> None:
     result = turbopi("demo", "--real-time", "--episodes", 2, "--report", tmp_path, "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads((tmp_path / "real_time.json").read_text())
-    assert [(way["execution"], way["delay"]) for way in told["ways"]] == [
+    reported = json.loads((tmp_path / "real_time.json").read_text())
+    assert [(way["execution"], way["delay"]) for way in reported["ways"]] == [
         ("async", 0),
         ("async", 4),
         ("rtc_trained", 4),
     ]
-    for way in told["ways"]:
+    for way in reported["ways"]:
         assert way["success"]["trials"] == 2 == len(way["outcomes"])
         assert way["success"]["successes"] == way["outcomes"].count("s")
         assert f"{way['success']['successes']} of 2 " in result.stderr
-    assert told["delay_costs"]["pairs"] == told["joining_gains"]["pairs"] == 2
+    assert reported["delay_costs"]["pairs"] == reported["joining_gains"]["pairs"] == 2
     assert (tmp_path / "real_time.png").exists() and (tmp_path / "commands.png").exists()
 
 
@@ -277,7 +277,7 @@ def test_episodes_of_libero_are_few(tmp_path: Path) -> None:
     ("options", "why"),
     [
         (("--episodes", "0"), "--real-time plays episodes, and --episodes is 0"),
-        (("--frames", "2"), "--frames is for pictures of LIBERO"),
+        (("--frames", "2"), "--frames is for images of LIBERO"),
     ],
 )
 def test_the_real_time_demo_refuses_what_it_would_ignore(options: tuple[str, str], why: str, tmp_path: Path) -> None:

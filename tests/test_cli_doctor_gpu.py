@@ -118,8 +118,8 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
 
 def test_every_tier_but_the_small_ones_has_a_row(fake: Fake) -> None:
     fake((9, 0))
-    told = {name.removeprefix("GPU 0 ") for name in rows() if name.startswith("GPU 0 ")}
-    assert told == {"tiles", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
+    reported = {name.removeprefix("GPU 0 ") for name in rows() if name.startswith("GPU 0 ")}
+    assert reported == {"tiles", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
 
 
 @pytest.mark.parametrize(

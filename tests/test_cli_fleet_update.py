@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from turbopi.checkpoint import random_checkpoint
-from turbopi.cli.fleet_update import Asked, as_before, changes, of_the_front, runs, scale_of, scaled_as
+from turbopi.cli.fleet_update import Requested, as_before, changes, of_the_front, runs, scale_of, scaled_as
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.serve_ray import robot_of
 from turbopi.serve.fleet.fleet import FleetOptions
@@ -14,13 +14,13 @@ from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import ConfigError
 
 TINY = PolicyOptions(random_weights="pi05_tiny")
-FIRST = Asked(
+FIRST = Requested(
     replace(TINY, backend="fused", precision="fp8", steps=5, device="cuda", default_prompt="fold the shirt"),
     ServerOptions(queue_limit=4, max_batch=16, execution="rtc", control_hz=50),
     warmup=True,
     strict=True,
 )
-TYPED = Asked(TINY, ServerOptions(port=1), warmup=True, strict=False)  # an update with nothing given
+TYPED = Requested(TINY, ServerOptions(port=1), warmup=True, strict=False)  # an update with nothing given
 OPTIONS = FleetOptions("arms", "v1")
 
 
@@ -38,8 +38,8 @@ def test_what_is_not_given_stays() -> None:
 
 
 def test_what_is_given_counts_be_it_the_default() -> None:
-    asked = replace(TYPED, policy=replace(TINY, steps=10, backend="auto"))
-    after = asked.kept(running(), given=("steps", "backend", "strict"))
+    requested = replace(TYPED, policy=replace(TINY, steps=10, backend="auto"))
+    after = requested.kept(running(), given=("steps", "backend", "strict"))
     assert (after.policy.steps, after.policy.backend, after.strict) == (10, "auto", False)
     assert after.policy.precision == "fp8" and after.server.max_batch == 16
 
@@ -57,11 +57,11 @@ def test_a_calibration_is_not_kept_for_other_weights() -> None:
     before = running() | {"quantization": "/v1/q.json", "fp8_parts": "expert"}
     with pytest.raises(ConfigError, match=r"the running fleet has --quantization /v1/q.json, .* give --quantization"):
         TYPED.kept(before, given=())
-    asked = replace(TYPED, policy=replace(TINY, quantization="/v2/q.json"))
-    after = asked.kept(before, given=("quantization",)).policy
+    requested = replace(TYPED, policy=replace(TINY, quantization="/v2/q.json"))
+    after = requested.kept(before, given=("quantization",)).policy
     assert (after.quantization, after.fp8_parts, after.precision) == ("/v2/q.json", "expert", "fp8")
-    asked = replace(TYPED, policy=replace(TINY, precision="bf16"))
-    after = asked.kept(before, given=("precision",)).policy
+    requested = replace(TYPED, policy=replace(TINY, precision="bf16"))
+    after = requested.kept(before, given=("precision",)).policy
     assert (after.quantization, after.fp8_parts, after.precision) == (None, None, "bf16")
 
 
@@ -76,14 +76,14 @@ def test_a_fleet_that_cannot_say_what_it_runs_is_not_updated() -> None:
 
 
 def test_each_change_is_told_on_a_line_and_what_stays_on_one() -> None:
-    asked = replace(TYPED, policy=replace(TINY, precision="bf16"), server=ServerOptions(max_batch=1))
-    after = asked.kept(running(), given=("precision", "max_batch"))
+    requested = replace(TYPED, policy=replace(TINY, precision="bf16"), server=ServerOptions(max_batch=1))
+    after = requested.kept(running(), given=("precision", "max_batch"))
     metadata = {"config": "pi05_tiny", "precision": "fp8", "num_denoising_steps": 5, "solver": "euler"}
     metadata["time_grid"] = "uniform"
     new = runs(replace(after.policy, steps=None), random_checkpoint("pi05_tiny", 0, "auto"))
     lines = changes(running(), after.plain() | scale_of(OPTIONS, 3, use_gpus=True), metadata, new)
     assert lines == ["precision: fp8 -> bf16", "steps: 5 -> 10", "max-batch: 16 -> 1", "replicas: 2 -> 3"]
-    assert as_before(asked.plain(), after.plain()) == [
+    assert as_before(requested.plain(), after.plain()) == [
         "--backend fused",
         "--steps 5",
         "--device cuda",

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
-from turbopi.cli.framework import Output, plain, with_errors_told
+from turbopi.cli.framework import Output, plain, with_errors_reported
 from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import OF_POLICIES, OF_SERVERS, as_typed
 from turbopi.policy.policy import UnifiedPolicy
@@ -77,9 +77,9 @@ def test_help_is_whole_at_eighty_columns(words: tuple[str, ...], monkeypatch: py
 def test_an_option_whose_value_is_called_as_itself_has_its_name_written_out(command: Any) -> None:
     """Typer 0.27 takes the name from `metavar` otherwise: `--DEVICE`."""
     for parameter in inspect.signature(command.callback).parameters.values():
-        for told in getattr(parameter.annotation, "__metadata__", ()):
-            if isinstance(told, typer.models.OptionInfo) and str(told.metavar).lower() == parameter.name:
-                names = [told.default, *(told.param_decls or ())]  # Typer moves the first later
+        for reported in getattr(parameter.annotation, "__metadata__", ()):
+            if isinstance(reported, typer.models.OptionInfo) and str(reported.metavar).lower() == parameter.name:
+                names = [reported.default, *(reported.param_decls or ())]  # Typer moves the first later
                 assert f"--{parameter.name}" in names, parameter.name
 
 
@@ -143,15 +143,15 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
     golden = GOLDEN / "pi05" / "torch"
     with pytest.raises(ConfigError, match=r"Choose with config= one of pi05_base, "):
         open_checkpoint(golden)
-    told = refusal(turbopi("convert", golden, tmp_path / "out"))
-    assert "Choose with --config one of pi05_base, " in told and "config=" not in told
-    told = turbopi("inspect", golden).stdout
-    assert "Choose with --config one of pi05_base, " in told and "config=" not in told
+    reported = refusal(turbopi("convert", golden, tmp_path / "out"))
+    assert "Choose with --config one of pi05_base, " in reported and "config=" not in reported
+    reported = turbopi("inspect", golden).stdout
+    assert "Choose with --config one of pi05_base, " in reported and "config=" not in reported
     assert refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi06")).startswith(
         "--config pi06 is neither a preset, nor 'auto', nor a path to a .json; presets are pi05_base, "
     )
-    told = refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi05_liberoo"))
-    assert "; did you mean pi05_libero? Presets are pi05_base, " in told
+    reported = refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi05_liberoo"))
+    assert "; did you mean pi05_libero? Presets are pi05_base, " in reported
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_wrong_values_of_shared_options_are_refused(option: str, value: str, exp
 
 def errors_of(work: Callable[[], None], capsys: Any, debug: bool = False) -> tuple[int, str]:
     with pytest.raises(typer.Exit) as stopped:
-        with_errors_told(work, debug=debug)
+        with_errors_reported(work, debug=debug)
     return stopped.value.exit_code, capsys.readouterr().err
 
 
@@ -289,8 +289,8 @@ def test_a_bar_is_drawn_once_its_first_stage_is_known(monkeypatch: pytest.Monkey
     monkeypatch.setattr("turbopi.cli.progress.new_console", lambda *, stderr: console)
     monkeypatch.setattr(Output, "shows_progress", True)
 
-    def work(told: tuple[Callable[[str, int], None], Callable[[], None]]) -> str:
-        begin, advance = told
+    def work(reported: tuple[Callable[[str, int], None], Callable[[], None]]) -> str:
+        begin, advance = reported
         begin("a stage", 2)
         advance()
         return "done"

@@ -145,7 +145,7 @@ def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Pat
     folder = tmp_path / "by hand"
     folder.mkdir()
     (folder / "observation.json").write_text('{"observation/image": {"file": "table.png"}}')
-    (folder / "table.png").write_bytes(b"picture")
+    (folder / "table.png").write_bytes(b"image")
     call = next(recording.rglob("*.npz"))
     for source, *targets in (
         (npz, "-o", npz),
@@ -155,7 +155,7 @@ def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Pat
     ):
         refused = refusal(turbopi("infer", *TINY, source, *targets))
         assert "is the observation itself, or part of it: write to another file" in refused
-    assert (folder / "table.png").read_bytes() == b"picture"
+    assert (folder / "table.png").read_bytes() == b"image"
 
 
 @pytest.mark.slow
@@ -171,10 +171,10 @@ def test_noise_from_a_file_is_what_the_model_starts_from(npz: Path, tmp_path: Pa
 
 
 def test_without_a_seed_the_one_drawn_is_told_and_gives_the_same_again(npz: Path, tmp_path: Path) -> None:
-    told = re.search(r"--seed (\d+) gives these actions again", infer(tmp_path, npz, "--no-plot").stdout)
-    assert told is not None
+    reported = re.search(r"--seed (\d+) gives these actions again", infer(tmp_path, npz, "--no-plot").stdout)
+    assert reported is not None
     drawn = actions_in(tmp_path)
-    infer(tmp_path, npz, "--no-plot", "--seed", told[1])
+    infer(tmp_path, npz, "--no-plot", "--seed", reported[1])
     np.testing.assert_array_equal(actions_in(tmp_path), drawn)
 
 
@@ -200,8 +200,8 @@ def test_wrong_paths_are_told_what_infer_takes() -> None:
 
 
 def test_paths_in_the_wrong_order_are_told_so(npz: Path, tmp_path: Path) -> None:
-    told = refusal(turbopi("infer", npz, tmp_path))
-    assert told == f"{npz} is a file, but the checkpoint's folder comes first: is it {tmp_path}?"
+    reported = refusal(turbopi("infer", npz, tmp_path))
+    assert reported == f"{npz} is a file, but the checkpoint's folder comes first: is it {tmp_path}?"
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ def test_bad_arguments_are_refused_before_anything_is_loaded(
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "reported"),
     [
         ({"observation/wrist_image": None}, "the observation has no 'observation/wrist_image'"),
         ({"observation/state": np.zeros(7)}, "observation/state has shape (7,), expected shape (8,)"),
@@ -239,14 +239,14 @@ def test_bad_arguments_are_refused_before_anything_is_loaded(
     ],
 )
 def test_an_observation_the_robot_cannot_use_is_refused_before_weights_are_loaded(
-    wrong: dict[str, Any], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: dict[str, Any], reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(UnifiedPolicy, "__init__")
     content = {key: value for key, value in (observation() | wrong).items() if value is not None}
     np.savez(npz := tmp_path / "observation.npz", **content)
     result = turbopi("infer", *TINY, npz, "-o", tmp_path / "actions.npz")
     assert result.exit_code == 2
-    assert f"error: {npz}: {told}" in result.stderr
+    assert f"error: {npz}: {reported}" in result.stderr
     assert not (tmp_path / "actions.npz").exists()
 
 

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
-from turbopi.cli.capabilities import offers_of
+from turbopi.cli.capabilities import capabilities_of
 from turbopi.cli.framework import Output
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.ports import why_not_free
@@ -113,8 +113,8 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
     monkeypatch.setattr(
         "turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy, **asdict(options))
     )
-    asked = ["--queue-limit", 3, "--max-message-mb", 1.5, "--max-batch", 1, "--deadline-ms", 200]
-    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *asked)
+    requested = ["--queue-limit", 3, "--max-message-mb", 1.5, "--max-batch", 1, "--deadline-ms", 200]
+    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *requested)
     assert result.exit_code == 0, result.output
     assert not hasattr(served["policy"], "warmup")
     assert served["policy"].metadata["num_denoising_steps"] == 2
@@ -128,8 +128,8 @@ def test_what_a_server_is_to_join_reaches_it(monkeypatch: Any) -> None:
     monkeypatch.setattr(
         "turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy, **asdict(options))
     )
-    asked = ["--execution", "rtc_identity", "--control-hz", 50, "--execution-horizon", 6, "--delay-steps", 2]
-    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *asked)
+    requested = ["--execution", "rtc_identity", "--control-hz", 50, "--execution-horizon", 6, "--delay-steps", 2]
+    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *requested)
     assert result.exit_code == 0, result.output
     names = ("execution", "control_hz", "execution_horizon", "delay_steps")
     assert [served[name] for name in names] == ["rtc_identity", 50.0, 6, 2]
@@ -175,16 +175,16 @@ def test_what_a_policy_offers_is_known_before_its_weights_are_loaded(
     config = tmp_path / "mine.json"
     config.write_text(json.dumps({"preset": "pi05_tiny", **settings}))
     options = PolicyOptions(random_weights="pi05_tiny", config=str(config), backend=backend, device="cpu")
-    offers, policy = offers_of(options, options.open(None)), options.make_policy(options.open(None), Output())
-    assert offers.real_time == policy.metadata["real_time"]
-    assert (offers.pipelined, offers.batch_modes) == (policy.pipelined, policy.batch_modes)
-    assert ("rtc_trained" in offers.real_time["modes"]) == ("real_time" in settings)
+    offered, policy = capabilities_of(options, options.open(None)), options.make_policy(options.open(None), Output())
+    assert offered.real_time == policy.metadata["real_time"]
+    assert (offered.pipelined, offered.batch_modes) == (policy.pipelined, policy.batch_modes)
+    assert ("rtc_trained" in offered.real_time["modes"]) == ("real_time" in settings)
 
 
 def test_what_backends_for_gpus_offer_is_known_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends, "check", lambda *_: None)
     found = {
-        name: offers_of(options, options.open(None))
+        name: capabilities_of(options, options.open(None))
         for name in ("fused", "cuda_graph", "tensorrt", "tensorrt_pipelined")
         if (options := PolicyOptions(random_weights="pi05_tiny", backend=name, device="cpu"))
     }
@@ -197,7 +197,7 @@ def test_what_backends_for_gpus_offer_is_known_without_one(monkeypatch: pytest.M
     assert [name for name, one in found.items() if one.real_time["modes"]] == ["fused", "cuda_graph"]
     heun = PolicyOptions(random_weights="pi05_tiny", backend="tensorrt", device="cpu", solver="heun")
     with pytest.raises(ConfigError, match="takes Euler's steps on the uniform grid alone"):
-        offers_of(heun, heun.open(None))
+        capabilities_of(heun, heun.open(None))
 
 
 def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:

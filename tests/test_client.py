@@ -324,7 +324,7 @@ def test_a_reset_is_told_once_to_a_server_that_keeps_the_running_chunk() -> None
 
 
 @pytest.mark.parametrize(
-    ("execution", "keys", "told"),
+    ("execution", "keys", "reported"),
     [
         (None, {}, False),
         (None, {"turbopi/session": "a", "turbopi/mode": "rtc"}, True),
@@ -335,10 +335,10 @@ def test_a_reset_is_told_once_to_a_server_that_keeps_the_running_chunk() -> None
     ],
 )
 def test_a_reset_is_told_where_there_is_something_to_forget(
-    execution: str | None, keys: dict[str, Any], told: bool
+    execution: str | None, keys: dict[str, Any], reported: bool
 ) -> None:
     answer = {"actions": np.zeros((1, 4, 7))} if "turbopi/batch" in keys else ACTIONS
     with foreign({"real_time": {"modes": MODES, "execution": execution}}, answer) as (client, received):
         client.reset()
         client.infer(keys)
-        assert received == [{**keys, "turbopi/reset": True} if told else keys]
+        assert received == [{**keys, "turbopi/reset": True} if reported else keys]

@@ -66,9 +66,9 @@ def test_what_asks_for_nothing_changes_no_bit(kind: Kind, precision: Any) -> Non
         Conditioning(tokens=TokenTimes.plain(N, 10, model.config.time_grid)),
     ]
     one_each: list[Conditionings] = [[None], [nothing[2]]]
-    for asked in (*nothing, *one_each):
+    for requested in (*nothing, *one_each):
         trace: Trace = {}
-        assert torch.equal(model.denoise(cache, noise, N, conditioning=asked, trace=trace), plain["actions"])
+        assert torch.equal(model.denoise(cache, noise, N, conditioning=requested, trace=trace), plain["actions"])
         assert torch.equal(trace["v_t"], plain["v_t"])
 
 
@@ -225,22 +225,22 @@ def test_rows_of_a_batch_have_conditionings_of_their_own(kind: Kind) -> None:
     short.token_mask[:, 3:] = False
     both = Observation(*(torch.cat((getattr(case.observation, f.name), getattr(short, f.name))) for f in fields()))
     noise = torch.cat((case.noise, -case.noise))
-    asked = [
+    requested = [
         Conditioning(held=np.arange(10) < 2, values=chunk(1)),
         Conditioning(guidance=guidance("jacobian", kind=model.config.time_grid)),
     ]
     trace: Trace = {}
-    together = model.sample(both, noise, N, conditioning=asked, trace=trace)
+    together = model.sample(both, noise, N, conditioning=requested, trace=trace)
     assert trace["v_t"].shape == (N, 2, 10, 32) and trace["times"].shape == (N, 2, 10)
     for row, one in enumerate((case.observation, short)):
-        alone = model.sample(one, noise[row : row + 1], N, conditioning=asked[row])
+        alone = model.sample(one, noise[row : row + 1], N, conditioning=requested[row])
         torch.testing.assert_close(together[row : row + 1], alone, rtol=1e-5, atol=1e-5)
-    for all_rows in (asked[0], asked[1]):
+    for all_rows in (requested[0], requested[1]):
         together = model.sample(both, noise, N, conditioning=all_rows)
         alone = model.sample(short, noise[1:], N, conditioning=all_rows)
         torch.testing.assert_close(together[1:], alone, rtol=1e-5, atol=1e-5)
     with pytest.raises(ObservationError, match="1 conditionings were given for 2 observations"):
-        model.sample(both, noise, N, conditioning=asked[:1])
+        model.sample(both, noise, N, conditioning=requested[:1])
 
 
 def fields() -> Any:
@@ -310,15 +310,15 @@ def test_identity_guidance_is_lerobots(tmp_path: Path) -> None:
     plain = {n: model.denoise(cache, torch.from_numpy(inputs["noise"])[None], n) for n in (3, 5, 10)}
     for index, run in enumerate(runs):
         previous = stored[f"{index}/prev"] if run["prev_rows"] else None
-        asked = Conditioning(guidance=lerobot_guidance(run, previous))
+        requested = Conditioning(guidance=lerobot_guidance(run, previous))
         noise = torch.from_numpy(inputs["noise"])[None]
-        ours = model.denoise(cache, noise, run["num_steps"], conditioning=asked)[0, :, :7]
+        ours = model.denoise(cache, noise, run["num_steps"], conditioning=requested)[0, :, :7]
         theirs = torch.from_numpy(stored[f"{index}/normalized_actions"])
         assert float((ours - theirs).abs().max()) <= 1e-5, run
         if previous is not None and run["inference_delay"]:
             assert float((plain[run["num_steps"]][0, :, :7] - theirs).abs().max()) > 1e-2
         if previous is not None:
-            given = policy.infer(observation, noise=inputs["noise"], conditioning=asked, num_steps=run["num_steps"])
+            given = policy.infer(observation, noise=inputs["noise"], conditioning=requested, num_steps=run["num_steps"])
             np.testing.assert_allclose(given["actions"], stored[f"{index}/actions"], rtol=1e-4, atol=1e-4)
 
 
@@ -326,7 +326,7 @@ def test_identity_guidance_is_lerobots(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("requested", "message"),
     [
         (Conditioning(TokenTimes.plain(3, 10)), r"token times are float32 of shape \[3, 10\]; .* shape \[4, 10\]"),
         (Conditioning(held=np.ones(9, bool), values=chunk(0)), r"held is bool of shape \[9\]; .* shape \[10\]"),
@@ -343,10 +343,10 @@ def test_identity_guidance_is_lerobots(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(asked: Conditioning, message: str) -> None:
+def test_what_does_not_fit_is_refused(requested: Conditioning, message: str) -> None:
     model, cache, noise = cached("pi05")
     with pytest.raises(ObservationError, match=message):
-        model.denoise(cache, noise, N, conditioning=asked)
+        model.denoise(cache, noise, N, conditioning=requested)
 
 
 def test_token_times_are_checked() -> None:

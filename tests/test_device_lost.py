@@ -166,8 +166,8 @@ def test_the_table_is_what_cuda_says() -> None:
     driver = pytest.importorskip("cuda.bindings.driver")
     names = {int(error): error.name for error in driver.CUresult}
     assert {n: lost._SAID[n][0] for n in STICKY if n in names} == {n: names[n] for n in STICKY if n in names}
-    told = {int(e) for e in runtime.cudaError_t if "process must be terminated and relaunched" in _words(e.__doc__)}
-    assert told <= set(STICKY)
+    reported = {int(e) for e in runtime.cudaError_t if "process must be terminated and relaunched" in _words(e.__doc__)}
+    assert reported <= set(STICKY)
 
 
 def _words(text: str | None) -> str:
@@ -186,22 +186,22 @@ def _words(text: str | None) -> str:
 def test_an_unknown_error_asks_the_device(
     monkeypatch: pytest.MonkeyPatch, answer: RuntimeError | None, is_lost: bool
 ) -> None:
-    asked: list[torch.device] = []
+    requested: list[torch.device] = []
 
     def synchronize(device: torch.device) -> None:
-        asked.append(device)
+        requested.append(device)
         if answer is not None:
             raise answer
 
     monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
     reason = why_lost(RuntimeError("CUDA error: CUBLAS_STATUS_EXECUTION_FAILED when calling `cublasGemmEx(…)`"), GPU)
-    assert asked == [GPU]
+    assert requested == [GPU]
     assert (reason is not None) == is_lost
     if answer is not None and is_lost and reason is not None:
         assert str(answer) in reason and "CUBLAS_STATUS_EXECUTION_FAILED" in reason
     assert why_lost(ValueError("could not broadcast"), GPU) is None
     assert why_lost(torch.OutOfMemoryError("CUDA out of memory"), GPU) is None
-    assert asked == [GPU]
+    assert requested == [GPU]
 
 
 def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None:

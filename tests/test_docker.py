@@ -69,8 +69,8 @@ def test_an_image_installs_the_extras_that_it_is_built_with() -> None:
     """By the shell's own expansion; the document's extras are the package's."""
     (installed,) = re.findall(r'pip install ("\..*?") ', (ROOT / "Dockerfile").read_text(encoding="utf-8"))
     for extras, expected in (("", "."), ("ray", ".[ray]"), ("ray,view", ".[ray,view]")):
-        told = subprocess.run(["sh", "-c", f"printf %s {installed}"], env={"EXTRAS": extras}, capture_output=True)
-        assert told.stdout.decode() == expected
+        reported = subprocess.run(["sh", "-c", f"printf %s {installed}"], env={"EXTRAS": extras}, capture_output=True)
+        assert reported.stdout.decode() == expected
     assert 'EXTRAS=""' in instructions(ROOT / "Dockerfile", "ARG")
     named = re.findall(r"EXTRAS=([\w,]+)", (ROOT / "docs/docker.md").read_text(encoding="utf-8"))
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ from turbopi.support.errors import BackendUnavailable
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
-GPUS_ASKED_FOR = ("rtx4090", "rtx5090", "l40s", "a100", "orin", "thor", "h100", "h200")  # issues and users name them
+GPUS_REQUESTED = ("rtx4090", "rtx5090", "l40s", "a100", "orin", "thor", "h100", "h200")  # issues and users name them
 
 
 @lru_cache
@@ -58,7 +58,7 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
 
 
 def test_every_gpu_asked_for_has_its_rows() -> None:
-    for key in GPUS_ASKED_FOR:
+    for key in GPUS_REQUESTED:
         assert TEXT.count(f"\n| {find_gpu(key).name} |") == 2, "what was done, and what it may take"
 
 

@@ -135,10 +135,10 @@ def test_a_calibration_for_other_numbers_is_refused() -> None:
 
 
 def test_metadata_tells_the_plan_and_that_it_is_emulated(calibration: Quantization) -> None:
-    told = emulated(calibration.only(["prefix"]), "fp8").describe()["fp8"]
-    assert told["emulated"] == "in float32" and told["observations"] == "the golden cases themselves"
-    assert told["plan"]["vision.fc1"] == "bf16: FP8 is switched off in the vision"
-    assert told["identity"] != calibration.identity
+    reported = emulated(calibration.only(["prefix"]), "fp8").describe()["fp8"]
+    assert reported["emulated"] == "in float32" and reported["observations"] == "the golden cases themselves"
+    assert reported["plan"]["vision.fc1"] == "bf16: FP8 is switched off in the vision"
+    assert reported["identity"] != calibration.identity
 
 
 class FewWords:

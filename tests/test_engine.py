@@ -36,9 +36,9 @@ def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32",
     cache = Cache.allocate(
         model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype, ops is OPS
     )
-    pictures = Images(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
+    camera_images = Images(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
     table = modulation(model.config, weights.conditioning, shape.loop.steps)
-    call = StaticCall(model.config, weights, ops, shape, pictures, cache, table)
+    call = StaticCall(model.config, weights, ops, shape, camera_images, cache, table)
     if ops is OPS and table is not None:
         call.denoiser = dataclasses.replace(
             Denoiser.prepare(model.config, weights, table), slots=shape.prefix_slots(model.config)

@@ -237,18 +237,18 @@ def test_what_a_denoiser_keeps_serves_as_what_the_operations_keep(times: Times, 
     problem = Problem.of("pi05", times)
     ops, back = few_tokens() if kernels else (PLAIN, PLAIN_BACKWARD)
     x_t, horizon, config = problem.chunk(0), problem.horizon, problem.model.config
-    asked = Conditioned.allocate(config, ConditionedLoop(1, horizon, (1.0, 0.0), True), torch.device("cpu"))
-    asked.tokens.times.fill_(0.6), asked.tokens.gain.fill_(0.7)
-    asked.tokens.target.copy_(problem.chunk(1)), asked.weights.copy_(torch.linspace(1, 0, horizon)[:, None])
-    asked.tokens.steps.copy_(-torch.linspace(0, 1, horizon))
+    requested = Conditioned.allocate(config, ConditionedLoop(1, horizon, (1.0, 0.0), True), torch.device("cpu"))
+    requested.tokens.times.fill_(0.6), requested.tokens.gain.fill_(0.7)
+    requested.tokens.target.copy_(problem.chunk(1)), requested.weights.copy_(torch.linspace(1, 0, horizon)[:, None])
+    requested.tokens.steps.copy_(-torch.linspace(0, 1, horizon))
     tokens = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0]
-    expected = jacobian_velocity(problem.expert(horizon, ops, back), asked, 0, x_t, tokens, problem.time_embs[0])
+    expected = jacobian_velocity(problem.expert(horizon, ops, back), requested, 0, x_t, tokens, problem.time_embs[0])
     v_t, next_x = torch.full_like(x_t, torch.nan), torch.full_like(x_t, torch.nan)
     expert = problem.expert(horizon, ops, back)
     forward = GoesForward(problem, expert)
-    jacobian_step(in_rows(expert), asked, 0, forward, x_t, v_t, next_x)
+    jacobian_step(in_rows(expert), requested, 0, forward, x_t, v_t, next_x)
     assert expected.isfinite().all() and relative(v_t, expected) < 1e-6
-    assert relative(next_x, asked.next_x(0, x_t, expected)) < 1e-6
+    assert relative(next_x, requested.next_x(0, x_t, expected)) < 1e-6
 
 
 def without_keys(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

@@ -68,10 +68,12 @@ def test_packed_rows(observations: list[tuple[int, int]], spare: int, empty: int
     assert (starts[1:] == starts[:-1] + lengths[:-1]).all()
     seen = 0
     for start, length, count, prompt in zip(starts, lengths, counts, prompts, strict=False):
-        own, pictures = packed.source[start : start + length], count * per_image
-        assert (own[:pictures] == np.arange(seen, seen + pictures)).all() and (-1 - own[pictures:] == prompt).all()
+        own, camera_images = packed.source[start : start + length], count * per_image
+        assert (own[:camera_images] == np.arange(seen, seen + camera_images)).all() and (
+            -1 - own[camera_images:] == prompt
+        ).all()
         assert (packed.positions[start : start + length] == np.arange(length)).all()
-        seen += pictures
+        seen += camera_images
     assert packed.tiles.shape == (most_tiles(rows, batch, heads), 4)
     queries = np.zeros(rows * heads, int)  # each row of queries is in one tile, and sees its own segment
     begins = [int(first) for first, end, _, _ in packed.tiles[::2] if first < end]
@@ -116,16 +118,16 @@ def batched(
     weights = pack(model.config, dict(model.state_dict()))
     rows = [HostRow.of(observation, row) for row in range(observation.batch_size)]
     shown = [image for row in rows for image in row.images]
-    pictures = Images(model.config, weights, PLAIN, len(shown), False, 0)
+    camera_images = Images(model.config, weights, PLAIN, len(shown), False, 0)
     size = BatchSize(batch, len(shown))
-    buffers = BatchBuffers(model.config, weights, PLAIN, size, pictures, slots + 16)
+    buffers = BatchBuffers(model.config, weights, PLAIN, size, camera_images, slots + 16)
     prefix = PackedPrefix(buffers, slots)
     prefix.write([len(row.images) for row in rows], [row.tokens for row in rows])
     table = modulation(model.config, weights.conditioning, steps)
     loop = BatchLoop(buffers, EulerLoop(steps, noise.shape[1]), by or weights, table)
     loop.write(noise.numpy(), observation.state.numpy())
-    send(pictures, shown)
-    pictures.run()
+    send(camera_images, shown)
+    camera_images.run()
     prefix.run()
     loop.run()
     return loop
@@ -133,7 +135,7 @@ def batched(
 
 @pytest.mark.slow
 def test_each_observation_gets_what_it_gets_alone(kind: Kind) -> None:
-    """Other cameras, prompts of other lengths, one without a picture, one without a prompt, and an empty place."""
+    """Other cameras, prompts of other lengths, one without an image, one without a prompt, and an empty place."""
     observation, noise = observations(kind, [2, 0, 3, 1], [7, 12, 3, 0], horizon=5)
     ours = batched(kind, observation, noise, batch=5, slots=32, steps=3)
     exact = golden_model(kind).sample(observation, noise, 3)
@@ -244,9 +246,9 @@ class TestBackend:
         exact = backend.sample(four, noise, 2).actions  # one by one
         assert backend.describe()["batches"] == []
         backend.warmup_batches(one, 2, 5, [4])
-        told = len(backend.told)
+        reported = len(backend.reported)
         torch.testing.assert_close(backend.sample(four, noise, 2).actions, exact, atol=2e-5, rtol=2e-5)
-        assert backend.told[told:] == ["run", "run", "run"], "vision, prefix and denoising of all four"
+        assert backend.reported[reported:] == ["run", "run", "run"], "vision, prefix and denoising of all four"
         with pytest.raises(ObservationError, match=r"5 observations at once.*policy\.warmup\(batches=5\)"):
             backend.sample(*observations("pi05", [2] * 5, [3] * 5, horizon=5), 2)
         with pytest.raises(ObservationError, match=r"4 observations with 12 images"):

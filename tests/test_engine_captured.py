@@ -23,7 +23,7 @@ FORBIDDEN = {
 }
 
 
-class Asking(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class Requesting(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Fails at an operation that a capture doesn't take."""
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -45,7 +45,7 @@ class Watched(OnCpu):
 def watched(run: Callable[..., None]) -> Callable[..., None]:
     @wraps(run)
     def captured(*arguments: Any) -> None:
-        with Asking():  # type: ignore[no-untyped-call]
+        with Requesting():  # type: ignore[no-untyped-call]
             run(*arguments)
 
     return captured
@@ -56,11 +56,11 @@ def watched(run: Callable[..., None]) -> Callable[..., None]:
 @pytest.mark.parametrize("rows", [1, 3])
 @pytest.mark.parametrize("which", ["plain", "ab2", "staircase", "held_and_identity", "jacobian_and_held"])
 def test_nothing_captured_asks_the_host(kind: Kind, rows: int, which: str) -> None:
-    asked: Any = {"plain": None, "ab2": Conditioning(integration=Integration("ab2", (1.0, 0.4, 0.0)))}
-    told = asked[which] if which in asked else conditioned(which, STEPS, H, A)
+    requested: Any = {"plain": None, "ab2": Conditioning(integration=Integration("ab2", (1.0, 0.4, 0.0)))}
+    reported = requested[which] if which in requested else conditioned(which, STEPS, H, A)
     made, noise = observations(kind, [1, 2, 0][:rows], [3, 5, 7][:rows], H)
     engine = on_cpu(kind, Watched)
-    assert engine.sample(made, noise, STEPS, conditioning=[told] * rows).actions.isfinite().all()
+    assert engine.sample(made, noise, STEPS, conditioning=[reported] * rows).actions.isfinite().all()
 
 
 @pytest.mark.parametrize(

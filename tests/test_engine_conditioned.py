@@ -30,35 +30,35 @@ def engine(request: Any) -> OnCpu:
     return on_cpu(request.param)
 
 
-def expected(kind: Kind, observation: Observation, noise: Tensor, asked: Any, steps: int = STEPS) -> Tensor:
-    return golden_model(kind).sample(observation, noise, steps, conditioning=asked)
+def expected(kind: Kind, observation: Observation, noise: Tensor, requested: Any, steps: int = STEPS) -> Tensor:
+    return golden_model(kind).sample(observation, noise, steps, conditioning=requested)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", FORMS)
 def test_every_form_equals_the_reference(engine: OnCpu, which: str) -> None:
     observation, noise = made_up(engine.config.kind, 2, 19)
-    asked = conditioned(which, STEPS, noise.shape[1], noise.shape[2])
-    found = engine.sample(observation, noise, STEPS, conditioning=asked).actions
-    torch.testing.assert_close(found, expected(engine.config.kind, observation, noise, asked), atol=2e-5, rtol=2e-5)
+    requested = conditioned(which, STEPS, noise.shape[1], noise.shape[2])
+    found = engine.sample(observation, noise, STEPS, conditioning=requested).actions
+    torch.testing.assert_close(found, expected(engine.config.kind, observation, noise, requested), atol=2e-5, rtol=2e-5)
 
 
 @pytest.mark.parametrize("which", ["held", "held_and_identity", "jacobian_and_held"])
 def test_held_actions_come_out_as_they_were_given(engine: OnCpu, which: str) -> None:
     observation, noise = made_up(engine.config.kind, 1, 7)
-    asked = conditioned(which, STEPS, noise.shape[1], noise.shape[2])
-    assert asked.held is not None and asked.values is not None
-    found = engine.sample(observation, noise, STEPS, conditioning=asked).actions[0].numpy()
-    np.testing.assert_array_equal(found[asked.held], asked.values[asked.held])
+    requested = conditioned(which, STEPS, noise.shape[1], noise.shape[2])
+    assert requested.held is not None and requested.values is not None
+    found = engine.sample(observation, noise, STEPS, conditioning=requested).actions[0].numpy()
+    np.testing.assert_array_equal(found[requested.held], requested.values[requested.held])
 
 
 def test_what_is_held_and_what_pulls_changes_without_a_new_capture(engine: OnCpu) -> None:
     observation, noise = made_up(engine.config.kind, 1, 7)
-    asked = [Conditioning(held=np.arange(7) < d, values=np.full((7, 32), d, np.float32)) for d in (1, 3, 6)] + [
+    requested = [Conditioning(held=np.arange(7) < d, values=np.full((7, 32), d, np.float32)) for d in (1, 3, 6)] + [
         conditioned("identity", STEPS, 7, 32, seed) for seed in range(2)
     ]
     kept = None
-    for one in asked:
+    for one in requested:
         found = engine.sample(observation, noise, STEPS, conditioning=one).actions
         torch.testing.assert_close(found, expected(engine.config.kind, observation, noise, one), atol=2e-5, rtol=2e-5)
         kept = len(engine._graphs.entries) if kept is None else kept
@@ -86,22 +86,22 @@ def test_rows_of_a_batch_have_conditionings_of_their_own(engine: OnCpu) -> None:
     one, noise = made_up(engine.config.kind, 2, 9)
     other, _ = made_up(engine.config.kind, 2, 9, seed=1)
     both = Observation(*(torch.cat((getattr(one, f), getattr(other, f))) for f in FIELDS))
-    asked = [None, conditioned("held", STEPS, 7, 32)]
+    requested = [None, conditioned("held", STEPS, 7, 32)]
     noises = noise.repeat(2, 1, 1)
-    found = engine.sample(both, noises, STEPS, conditioning=asked).actions
-    torch.testing.assert_close(found, expected(engine.config.kind, both, noises, asked), atol=2e-5, rtol=2e-5)
+    found = engine.sample(both, noises, STEPS, conditioning=requested).actions
+    torch.testing.assert_close(found, expected(engine.config.kind, both, noises, requested), atol=2e-5, rtol=2e-5)
     with pytest.raises(ObservationError, match="3 conditionings were given for 2 observations"):
         engine.sample(both, noises, STEPS, conditioning=[None, None, None])
 
 
 def test_denoise_alone_takes_a_conditioning(engine: OnCpu) -> None:
     observation, noise = made_up(engine.config.kind, 1, 7)
-    asked = conditioned("held_and_identity", STEPS, 7, 32)
-    whole = engine.sample(observation, noise, STEPS, conditioning=asked).actions
+    requested = conditioned("held_and_identity", STEPS, 7, 32)
+    whole = engine.sample(observation, noise, STEPS, conditioning=requested).actions
     cache = golden_model(engine.config.kind).prefix(observation)
-    alone = engine.denoise(cache, noise, STEPS, conditioning=asked)
+    alone = engine.denoise(cache, noise, STEPS, conditioning=requested)
     torch.testing.assert_close(alone, whole, atol=1e-5, rtol=1e-5)
-    trace = engine.intermediates(observation, noise, STEPS, conditioning=asked)
+    trace = engine.intermediates(observation, noise, STEPS, conditioning=requested)
     assert torch.equal(trace["actions"], whole) and trace["x_t"].shape == (STEPS + 1, 1, 7, 32)
 
 
@@ -110,12 +110,12 @@ def test_denoise_alone_takes_a_conditioning(engine: OnCpu) -> None:
 def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(kind: Kind, which: str) -> None:
     """Behind the given rows the engine's own cache is as it was allocated: NaN."""
     observation, noise = made_up(kind, 1, 5)
-    asked: Any = {"plain": None, "ab2": Conditioning(integration=Integration("ab2", (1.0, 0.4, 0.2, 0.1, 0.0)))}
-    told = asked[which] if which in asked else conditioned(which, STEPS, 7, 32)
+    requested: Any = {"plain": None, "ab2": Conditioning(integration=Integration("ab2", (1.0, 0.4, 0.2, 0.1, 0.0)))}
+    reported = requested[which] if which in requested else conditioned(which, STEPS, 7, 32)
     model = golden_model(kind)
     cache, fresh = model.prefix(observation), on_cpu(kind, Unrun)
-    found = fresh.denoise(cache, noise, STEPS, conditioning=told)
-    torch.testing.assert_close(found, model.denoise(cache, noise, STEPS, conditioning=told), atol=2e-5, rtol=2e-5)
+    found = fresh.denoise(cache, noise, STEPS, conditioning=reported)
+    torch.testing.assert_close(found, model.denoise(cache, noise, STEPS, conditioning=reported), atol=2e-5, rtol=2e-5)
     too_many = model.config.max_prompt_tokens + 1
     long = dataclasses.replace(cache, k=cache.k.new_zeros(*cache.k.shape[:3], 4 * 256 + too_many, cache.k.shape[4]))
     with pytest.raises(ObservationError, match=f"prompt tokens, this observation has 4 and {too_many}"):
@@ -126,15 +126,15 @@ def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(ki
 @pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian"])
 def test_bfloat16_is_as_close_to_float32_as_the_reference_is(which: str) -> None:
     case = golden_cases()["b_third_masked"]
-    asked = conditioned(which, 10, case.noise.shape[1], case.noise.shape[2])
+    requested = conditioned(which, 10, case.noise.shape[1], case.noise.shape[2])
     model = golden_model("pi05", "bf16")
     engine = OnCpu(
         model.config, lambda device, precision: dict(model.state_dict()), device=torch.device("cpu"), precision="bf16"
     )
     one = Observation(*(getattr(case.observation, f)[:1] for f in FIELDS))
-    exact = golden_model("pi05").sample(one, case.noise[:1], 10, conditioning=asked)
-    reference = model.sample(one, case.noise[:1], 10, conditioning=asked)
-    found = engine.sample(one, case.noise[:1], 10, conditioning=asked).actions
+    exact = golden_model("pi05").sample(one, case.noise[:1], 10, conditioning=requested)
+    reference = model.sample(one, case.noise[:1], 10, conditioning=requested)
+    found = engine.sample(one, case.noise[:1], 10, conditioning=requested).actions
     assert 0 < rms(found - exact) <= 1.5 * rms(reference - exact)
 
 
@@ -176,9 +176,9 @@ def test_a_loop_is_named_by_what_its_graph_is_for() -> None:
 def test_too_many_times_are_refused() -> None:
     config = golden_model("pi05").config
     times = np.linspace(1, 0, 30 * 50).reshape(30, 50)
-    asked = Conditioning(tokens=TokenTimes.of(np.sort(times, axis=0)[::-1]))
+    requested = Conditioning(tokens=TokenTimes.of(np.sort(times, axis=0)[::-1]))
     with pytest.raises(ObservationError, match=f"1451 different values; at most {MOST_TIMES} fit"):
-        loop_of_call(asked, 29, 50, config)
+        loop_of_call(requested, 29, 50, config)
 
 
 def test_backends_say_which_forms_they_have() -> None:

@@ -62,8 +62,8 @@ def engine_actions(
     shape = shape_of(observation, noise, STEPS)
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, torch.float32)
     table = modulation(model.config, weights.conditioning, STEPS)
-    pictures = Images(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
-    call = StaticCall(model.config, weights, PLAIN, shape, pictures, cache, table)
+    camera_images = Images(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
+    call = StaticCall(model.config, weights, PLAIN, shape, camera_images, cache, table)
     return answer(call, observation, noise), len(made)
 
 
@@ -192,12 +192,12 @@ def pack_with_hidden(hidden: int, rounded_kinds: tuple[str, ...], format: Format
 
 
 def vision_of(weights: Weights) -> Tensor:
-    """Tokens [256, D] of a made-up picture."""
+    """Tokens [256, D] of a made-up image."""
     config = golden_model("pi05").config
     generator = torch.Generator().manual_seed(0)
-    picture = torch.randint(0, 256, (1, 224, 224, 3), generator=generator, dtype=torch.uint8)
+    camera_image = torch.randint(0, 256, (1, 224, 224, 3), generator=generator, dtype=torch.uint8)
     out = torch.empty(config.vision.num_tokens, config.vlm.width)
-    forward.vision_tokens(config, weights, PLAIN, [lambda: picture], out)
+    forward.vision_tokens(config, weights, PLAIN, [lambda: camera_image], out)
     return out
 
 
@@ -278,9 +278,14 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend = fused(CPU, Quantization("0" * 64, shapes_of(config), every, report, "int8"), "int8")
     *before, last = (layer.qkv for layer in backend._weights.vlm)
     assert {matrix.numbers for matrix in before} == {torch.int8} and isinstance(last, Tensor)  # type: ignore[union-attr]
-    told = backend.describe()["int8"]["plan"]
-    assert told["expert"] == told["expert.down"] == told["prefix.out"] == "int8" and "expert of batches" not in told
-    assert told["prefix.qkv"]["int8"] == "layers 0, 1" and "bf16: INT8 has no NaN" in " ".join(told["prefix.qkv"])
+    reported = backend.describe()["int8"]["plan"]
+    assert (
+        reported["expert"] == reported["expert.down"] == reported["prefix.out"] == "int8"
+        and "expert of batches" not in reported
+    )
+    assert reported["prefix.qkv"]["int8"] == "layers 0, 1" and "bf16: INT8 has no NaN" in " ".join(
+        reported["prefix.qkv"]
+    )
     assert batch_weights(backend, PLAIN_LOOP).expert is backend._weights.expert
     assert backend.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"
     backend._on_hopper = False
@@ -295,9 +300,9 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
         User("single", EulerLoop(steps, 60), rows): "too many" for steps, rows in ((5, 968), (10, 968), (10, 1224))
     }
     backend._kernels = dict(refused)
-    told = backend.describe()
-    assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
-    plan = told["fp8"]["plan"]
+    reported = backend.describe()
+    assert reported["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
+    plan = reported["fp8"]["plan"]
     assert plan["prefix.down"] == "fp8"
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]

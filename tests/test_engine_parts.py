@@ -1,4 +1,4 @@
-"""Large batches go in parts, pictures through vision's head and the prefix between two attentions: nothing changes."""
+"""Large batches go in parts, images through vision's head and the prefix between two attentions: nothing changes."""
 
 import dataclasses
 import itertools
@@ -15,7 +15,7 @@ from test_begin import OnCpu, on_cpu
 from test_capture import DONE, FakeCuda, capture
 from test_engine import send
 from test_engine_batch import observations
-from test_resize import Resizing, picture
+from test_resize import Resizing, camera_image
 from torch import Tensor
 
 from turbopi.config import ImageResize
@@ -102,19 +102,19 @@ class TestAdded:
     def test_pictures_tokens_stay(self, every: int, part: int, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(call, "PART", part)
         side = golden_model("pi05").config.vision.image_size
-        shown = [picture(side, side, seed=seed) for seed in range(5)]
+        shown = [camera_image(side, side, seed=seed) for seed in range(5)]
         for layers in (1, 3):
             monkeypatch.setattr(forward, "HEAD_LAYERS", layers)
             found = []
             for ops in (PLAIN, adding(every)):
-                pictures = Images(golden_model("pi05").config, packed(), ops, 5, False, 0)
-                send(pictures, shown)
-                pictures.run()
-                found.append(pictures.embs)
+                camera_images = Images(golden_model("pi05").config, packed(), ops, 5, False, 0)
+                send(camera_images, shown)
+                camera_images.run()
+                found.append(camera_images.embs)
             assert bool(found[0].isfinite().all()) and torch.equal(*found)
 
     def test_one_observations_embeddings_are_not_written_over(self) -> None:
-        """Its prefix may be run again on the pictures' tokens, which another graph has left."""
+        """Its prefix may be run again on the images' tokens, which another graph has left."""
 
         def refused(*given: Any) -> bool:
             raise AssertionError("the embeddings would be written over")
@@ -148,9 +148,9 @@ def prefix(ops: Ops, fp8: bool, monkeypatch: pytest.MonkeyPatch, most: int, *, r
     model = golden_model("pi05")
     config = model.config
     weights = pack(config, dict(model.state_dict()), in_fp8 if fp8 else lambda place, matrix: matrix)
-    pictures = Images(config, weights, PLAIN, 6, False, 0)
-    pictures.embs.normal_(generator=torch.Generator().manual_seed(0))
-    buffers = BatchBuffers(config, weights, ops, BatchSize(4, 6), pictures, 160)
+    camera_images = Images(config, weights, PLAIN, 6, False, 0)
+    camera_images.embs.normal_(generator=torch.Generator().manual_seed(0))
+    buffers = BatchBuffers(config, weights, ops, BatchSize(4, 6), camera_images, 160)
     run = PackedPrefix(buffers, 150)
     run.write(CAMERAS, [np.arange(1, count) for count in (40, 47, 20, 30)])
     for _ in range(runs):
@@ -165,24 +165,24 @@ def in_fp8(place: str, matrix: Tensor) -> Matrix:
 def telling(ran: list[tuple[str, int]]) -> Ops:
     """Plain operations of the prefix that tell their names and numbers of rows."""
 
-    def told(name: str, twin: Any) -> Any:
+    def reported(name: str, reference: Any) -> Any:
         def run(x: Tensor, *rest: Any, **more: Any) -> Any:
             ran.append((name, len(x)))
-            return twin(x, *rest, **more)
+            return reference(x, *rest, **more)
 
         return run
 
     return dataclasses.replace(
         PLAIN,
-        residual_rms_norm=told("norm", PLAIN.residual_rms_norm),
-        linear=told("linear", PLAIN.linear),
-        residual_linear=told("residual", PLAIN.residual_linear),
-        linear_geglu=told("geglu", PLAIN.linear_geglu),
-        rope_split=told("rope", PLAIN.rope_split),
+        residual_rms_norm=reported("norm", PLAIN.residual_rms_norm),
+        linear=reported("linear", PLAIN.linear),
+        residual_linear=reported("residual", PLAIN.residual_linear),
+        linear_geglu=reported("geglu", PLAIN.linear_geglu),
+        rope_split=reported("rope", PLAIN.rope_split),
     )
 
 
-class TestPictures:
+class TestImages:
     """In parts, each with a head of its own."""
 
     @pytest.fixture(autouse=True, params=[1, 3])
@@ -201,12 +201,12 @@ class TestPictures:
         found = []
         for part, heads in ((count, 1), (2, -(-count // 2))):
             monkeypatch.setattr(call, "PART", part)
-            pictures = Images(golden_model("pi05").config, weights, PLAIN, count, dtype == torch.float32, 0)
-            uploads = pictures.uploads(shown, None, False)
+            camera_images = Images(golden_model("pi05").config, weights, PLAIN, count, dtype == torch.float32, 0)
+            uploads = camera_images.uploads(shown, None, False)
             assert len(uploads) == heads
-            send(pictures, shown)
-            pictures.run()
-            found.append(pictures.embs)
+            send(camera_images, shown)
+            camera_images.run()
+            found.append(camera_images.embs)
         assert bool(found[0].isfinite().all()) and torch.equal(*found)
 
     # the operation that stands in for the device's is openpi's way
@@ -219,14 +219,14 @@ class TestPictures:
     def test_actions_are_those_of_one_part(
         self, cls: type[OnCpu], resize: ImageResize, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Pictures of other sizes among those that fit, resized by the host and by the device, and again by others."""
+        """Images of other sizes among those that fit, resized by the host and by the device, and again by others."""
         made, noise = observations("pi05", CAMERAS, [7, 12, 3, 1], horizon=5)
         side = made.images.shape[2]
         sizes = ((side, side), (30, 50), (side, side), (40, 20))
         backends, single = {part: on_cpu("pi05", cls) for part in (100, 2)}, on_cpu()
         for seed in (0, 4):
             shown = [
-                [picture(*sizes[(row + camera) % 4], seed=seed + camera) for camera in range(count)]
+                [camera_image(*sizes[(row + camera) % 4], seed=seed + camera) for camera in range(count)]
                 for row, count in enumerate(CAMERAS)
             ]
             found = []
@@ -249,17 +249,17 @@ class TestPictures:
         monkeypatch.setattr(torch.cuda, "Event", lambda **options: event)
         write = Part.write
 
-        def telling_write(part: Part, pictures: Any) -> None:
-            DONE.append(f"{len(pictures)} sent")
-            write(part, pictures)
+        def telling_write(part: Part, camera_images: Any) -> None:
+            DONE.append(f"{len(camera_images)} sent")
+            write(part, camera_images)
 
         monkeypatch.setattr(Part, "write", telling_write)
         config = golden_model("pi05").config
-        pictures = Images(config, packed(), PLAIN, 5, False, 0)
-        graph = capture(pictures.run)
-        shown = [picture(config.vision.image_size, config.vision.image_size)] * 5
+        camera_images = Images(config, packed(), PLAIN, 5, False, 0)
+        graph = capture(camera_images.run)
+        shown = [camera_image(config.vision.image_size, config.vision.image_size)] * 5
         DONE.clear()
-        graph.launch(*pictures.uploads(shown, None, False))
+        graph.launch(*camera_images.uploads(shown, None, False))
         assert DONE == ["event", "2 sent", "launched", "2 sent", "launched", "1 sent", "launched", "launched"]
         with pytest.raises(AssertionError, match="5 things to do before 4 graphs"):
             graph.launch(*[lambda: None] * 5)
@@ -274,8 +274,8 @@ class TestPictures:
         rest = [row.tokens for row in rows], np.stack([row.state for row in rows]), noise.numpy()
         for cls, resize, wrong, error in (
             (OnCpu, None, shown[0][0][:3], "broadcast"),
-            (OnCpu, "openpi", picture(1, 900), "too narrow"),
-            (Resizing, "openpi", picture(1, 900), "too narrow"),
+            (OnCpu, "openpi", camera_image(1, 900), "too narrow"),
+            (Resizing, "openpi", camera_image(1, 900), "too narrow"),
         ):
             backend: Any = on_cpu("pi05", cls)
             expected = backend.begin_batch(shown, resize).finish(*rest, 2).actions

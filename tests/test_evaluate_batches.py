@@ -47,13 +47,13 @@ class Rows:
         self.bad = bad
         self.calls: list[tuple[list[int], dict[str, Any]]] = []
 
-    def infer_batch(self, observations: Any, *, seed: Any, **told: Any) -> list[dict[str, Any]]:
+    def infer_batch(self, observations: Any, *, seed: Any, **reported: Any) -> list[dict[str, Any]]:
         numbers = [one["number"] for one in observations]
-        self.calls.append((numbers, told))
+        self.calls.append((numbers, reported))
         if set(numbers) & set(self.bad):
             raise ActionError(f"nan among {numbers}")
         results = [{"actions": np.full((H, 7), float(n))} for n in numbers]
-        for result, each, wanted in zip(results, seed, told.get("model_actions", [False] * len(seed)), strict=True):
+        for result, each, wanted in zip(results, seed, reported.get("model_actions", [False] * len(seed)), strict=True):
             if wanted:
                 result["model_actions"] = np.full((H, 32), float(each), np.float32)
         return results
@@ -86,8 +86,8 @@ def test_one_row_that_is_not_finite_does_not_cost_the_others(joining: bool) -> N
     policy, chunks = Rows(1), [chunk(5, "rtc"), chunk(6, "rtc"), None]
     answers = ask(policy, [joins(one) for one in chunks] if joining else None)
     assert [numbers for numbers, _ in policy.calls] == [[0, 1, 2], [0], [1], [2]]
-    for one, (_, told) in zip(chunks, policy.calls[1:], strict=True):
-        assert told == ({"previous": [one], "model_actions": [True]} if joining else {})
+    for one, (_, reported) in zip(chunks, policy.calls[1:], strict=True):
+        assert reported == ({"previous": [one], "model_actions": [True]} if joining else {})
     assert [answer.problem for answer in answers] == [None, "nan among [1]", None]
     assert [answer.actions[0, 0] for answer in answers if answer.problem is None] == [0, 2]
     assert [bool(answer.for_next) for answer in answers] == [joining, False, joining]
@@ -104,7 +104,7 @@ class Uncaptured(OnCpu):
     """`OnCpu` whose warm-up runs nothing."""
 
     def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
-        return Untimed(run, after, self.told.append, at_once=False)
+        return Untimed(run, after, self.reported.append, at_once=False)
 
 
 @pytest.fixture(scope="module", params=[None, Uncaptured], ids=["pytorch", "engine"])
@@ -126,9 +126,9 @@ def test_a_request_alone_is_bit_for_bit_what_infer_gives(policy: UnifiedPolicy, 
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_rows_of_a_batch_have_their_own_chunk_and_seed(policy: UnifiedPolicy, mode: JoinMode) -> None:
     observations = [policy.example_observation(seed) for seed in range(3)]
-    told = [joins(chunk(7, mode)), joins(None), joins(chunk(8, mode, seed=1))]
-    answers = LocalPolicy(policy).infer(observations, [5, 9, 2], told)
-    for observation, seed, more, answer in zip(observations, (5, 9, 2), told, answers, strict=True):
+    reported = [joins(chunk(7, mode)), joins(None), joins(chunk(8, mode, seed=1))]
+    answers = LocalPolicy(policy).infer(observations, [5, 9, 2], reported)
+    for observation, seed, more, answer in zip(observations, (5, 9, 2), reported, answers, strict=True):
         expected = policy.infer(observation, seed=seed, **more)
         np.testing.assert_allclose(answer.actions, expected["actions"], atol=1e-4)
         np.testing.assert_allclose(answer.for_next["model_actions"], expected["model_actions"], atol=1e-4)
@@ -144,8 +144,8 @@ def test_after_warm_up_no_batch_of_the_run_captures_anything(mode: JoinMode | No
     for count in (2, 3):  # which are computed as 2 and as 4
         observations = [policy.example_observation(seed) for seed in range(count)]
         for chunks in (0, 1, count):  # rows that join
-            told = [joins(chunk(7, mode, seed=row) if mode and row < chunks else None) for row in range(count)]
-            source.infer(observations, list(range(count)), told)
+            reported = [joins(chunk(7, mode, seed=row) if mode and row < chunks else None) for row in range(count)]
+            source.infer(observations, list(range(count)), reported)
     after = policy.backend.describe()
     assert after["batches"] == captured["batches"] != []
     assert after["graphs"]["kept"] == captured["graphs"]["kept"]
@@ -180,8 +180,8 @@ class Batching(SeekingPolicy):
         self.warmups.append(arguments)
         return 1.5
 
-    def infer_batch(self, observations: Any, seed: Any, **told: Any) -> list[dict[str, Any]]:
-        model_actions = {"model_actions": np.zeros((HORIZON, 32), np.float32)} if told else {}
+    def infer_batch(self, observations: Any, seed: Any, **reported: Any) -> list[dict[str, Any]]:
+        model_actions = {"model_actions": np.zeros((HORIZON, 32), np.float32)} if reported else {}
         return [result | model_actions for result in super().infer_batch(observations, seed)]
 
 
@@ -196,7 +196,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Batching]:
 
     monkeypatch.setattr(PolicyOptions, "make_policy", make)
     offered = SimpleNamespace(real_time=Batching().metadata["real_time"])  # not the checkpoint's
-    monkeypatch.setattr("turbopi.cli.evaluate.offers_of", lambda *_: offered)
+    monkeypatch.setattr("turbopi.cli.evaluate.capabilities_of", lambda *_: offered)
     return policies
 
 

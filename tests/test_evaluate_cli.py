@@ -46,8 +46,8 @@ def test_eval_writes_its_folder_and_continues_it(tmp_path: Path) -> None:
     command = f"eval reacher {QUICK} --tasks 0,2 --max-steps 6 --out {out} --json"
     first = turbopi(command, "--trials", 1)
     assert first.exit_code == 0, first.output
-    told = json.loads(first.stdout)
-    assert (told["episodes"], told["success"]["trials"], told["crashes"]) == (2, 2, 0)
+    reported = json.loads(first.stdout)
+    assert (reported["episodes"], reported["success"]["trials"], reported["crashes"]) == (2, 2, 0)
     assert "RANDOM WEIGHTS" in first.stderr and "task 2, initial state 0: failure after 6 steps" in first.stderr
     assert {path.name for path in out.iterdir()} >= {"results.json", "report.html", "success.png", "latency.png"}
     second = turbopi(command, "--trials", 2)
@@ -205,8 +205,8 @@ def test_bad_input_is_refused_with_the_way_out(command: str, why: str, tmp_path:
 @pytest.mark.usefixtures("seeking")
 def test_anothers_file_is_not_replaced(file: str, command: str, tmp_path: Path) -> None:
     (tmp_path / file).write_text('{"floors": {}}')
-    told = refused(command, "--out", tmp_path)
-    assert f"{file} is there and isn't a" in told and "so it isn't replaced" in told
+    reported = refused(command, "--out", tmp_path)
+    assert f"{file} is there and isn't a" in reported and "so it isn't replaced" in reported
     assert [path.name for path in tmp_path.iterdir()] == [file]
 
 
@@ -223,9 +223,9 @@ def test_ways_beside_an_earlier_run_leave_its_pages_as_they_are(tmp_path: Path) 
 
 
 def test_a_policy_for_another_robot_is_refused(tmp_path: Path) -> None:
-    told = refused(f"eval reacher {QUICK} --robot plain", "--out", tmp_path / "never")
-    assert "the policy doesn't take the observations of reacher" in told
-    assert "use one for the robot libero, such as config pi05_libero" in told
+    reported = refused(f"eval reacher {QUICK} --robot plain", "--out", tmp_path / "never")
+    assert "the policy doesn't take the observations of reacher" in reported
+    assert "use one for the robot libero, such as config pi05_libero" in reported
 
 
 def test_without_the_simulator_its_install_command_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ class Counter:
 
     def observation(self) -> dict[str, Any]:
         assert self.looked
-        return {"picture": np.zeros((2, 2, 3), np.uint8), "count": len(self.actions)}
+        return {"image": np.zeros((2, 2, 3), np.uint8), "count": len(self.actions)}
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         self.actions.append(float(action[0]))
@@ -71,7 +71,7 @@ def ask(step: int, observation: dict[str, Any], arguments: Mapping[str, Any]) ->
 def carried_out(way: str, delay: int, every: int = 4, steps: int = 20) -> list[float]:
     world = Counter()
     execution = Execution(way, every, delay, lambda last: np.full(2, -1.0))
-    ending = run_episode(world, Job(TASK, 0), ask, execution, max_steps=steps, image_keys=("picture",))
+    ending = run_episode(world, Job(TASK, 0), ask, execution, max_steps=steps, image_keys=("image",))
     assert ending.steps == steps == len(ending.commands.values)
     return world.actions
 
@@ -106,7 +106,7 @@ def test_ensemble_averages_what_both_chunks_have() -> None:
 
 def test_seams_and_smoothness_are_measured_where_chunks_take_over() -> None:
     world, execution = Counter(), Execution("async", 4, 2)
-    motion = run_episode(world, Job(TASK, 0), ask, execution, max_steps=12, image_keys=("picture",)).motion
+    motion = run_episode(world, Job(TASK, 0), ask, execution, max_steps=12, image_keys=("image",)).motion
     assert motion is not None
     assert (motion.seams, motion.standing, motion.dropped) == (2, 0, 0)
     assert motion.seam_jump == pytest.approx(397)  # from 5 to 402, and from 405 to 802
@@ -145,9 +145,9 @@ def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
         )
         done.append((cell, results))
     page = write_delays(tmp_path, done)
-    told = document(done)
-    assert told.outcomes == ["sss", "ass", "sss", "sss"]
-    sync, delayed, _, other = told.cells
+    reported = document(done)
+    assert reported.outcomes == ["sss", "ass", "sss", "sss"]
+    sync, delayed, _, other = reported.cells
     assert sync.undelayed is None and sync.against is None
     assert delayed.undelayed is not None and (delayed.undelayed.only_first, delayed.undelayed.pairs) == (1, 3)
     assert other.against is not None and (other.against.only_second, other.against.both) == (1, 2)
@@ -186,18 +186,18 @@ def test_chunks_that_end_before_the_execution_horizon_are_refused_whatever_the_d
 
 
 def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
-    asked: list[dict[str, Any]] = []
+    requested: list[dict[str, Any]] = []
 
     class Policy:
         def __init__(self) -> None:
             self.metadata: dict[str, Any] = {}
 
         def infer_batch(self, observations: Any, seed: Any, **arguments: Any) -> list[dict[str, Any]]:
-            asked.append(arguments)
+            requested.append(arguments)
             return [{"actions": np.zeros((10, 7)), "model_actions": np.ones((10, 32), np.float32)}]
 
     (answer,) = LocalPolicy(Policy()).infer([{}], [3], [{"previous": None, "model_actions": True}])
-    assert asked == [{"previous": [None], "model_actions": [True]}]
+    assert requested == [{"previous": [None], "model_actions": [True]}]
     assert answer.for_next["model_actions"].shape == (10, 32)
 
 

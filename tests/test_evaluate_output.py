@@ -28,8 +28,8 @@ GROUPS = chunk_groups("libero", 7)
 
 
 def frame(step: int = 0, value: float = 0.5) -> Frame:
-    picture = np.full((32, 32, 3), 90, np.uint8)
-    return Frame(step, [picture, picture], np.full((10, 7), value), planned=5, done=0)
+    camera_image = np.full((32, 32, 3), 90, np.uint8)
+    return Frame(step, [camera_image, camera_image], np.full((10, 7), value), planned=5, done=0)
 
 
 def test_a_frame_shows_caption_pictures_and_chunk() -> None:
@@ -53,9 +53,9 @@ def test_any_chunk_can_be_drawn(value: float) -> None:
 def test_a_film_has_the_simulations_speed(tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v2", reason="pip install 'imageio[ffmpeg]'")
     write_video(tmp_path / "a.mp4", [frame(step) for step in range(0, 40, 5)], "x", "success", "libero", 20.0)
-    with imageio.get_reader(tmp_path / "a.mp4") as film:
-        assert film.get_meta_data()["fps"] == 8
-        assert film.count_frames() == 8 * 2 + 12  # each twice, the last one for another 1.5 s
+    with imageio.get_reader(tmp_path / "a.mp4") as on_frame:
+        assert on_frame.get_meta_data()["fps"] == 8
+        assert on_frame.count_frames() == 8 * 2 + 12  # each twice, the last one for another 1.5 s
 
 
 @pytest.mark.slow
@@ -195,8 +195,8 @@ def test_what_servers_tell_stands_for_their_weights(tmp_path: Path) -> None:
     one, other = (run(tmp_path / name, in_fp8(name * 12), states=(0,)) for name in "ab")
     for results, config in ((one, "pi05_base"), (other, "pi05_libero")):
         calibration = results.policy.identity["calibration"]
-        told = {"server": {"config": config}, "calibration": calibration}
-        results.policy = replace(results.policy, identity=told)
+        reported = {"server": {"config": config}, "calibration": calibration}
+        results.policy = replace(results.policy, identity=reported)
     assert len(compare([one, other])) == 2
     other.policy = replace(other.policy, identity={**other.policy.identity, "server": {"config": "pi05_base"}})
     with pytest.raises(ConfigError, match="FP8 of one model by different calibrations"):
@@ -234,10 +234,10 @@ def test_visited_observations_give_the_action_error(tmp_path: Path) -> None:
     visited, source = Visited(tmp_path, kept=4), LocalPolicy(SeekingPolicy())
     observations = []
     for number in range(9):
-        picture = np.full((32, 32, 3), 235, np.uint8)
-        picture[3 * number, 5] = (200, 40, 40)
+        camera_image = np.full((32, 32, 3), 235, np.uint8)
+        camera_image[3 * number, 5] = (200, 40, 40)
         state = np.zeros(8)
-        observation = {"observation/image": picture, "observation/state": state, "prompt": f"number {number}"}
+        observation = {"observation/image": camera_image, "observation/state": state, "prompt": f"number {number}"}
         observations.append(observation)
         visited(None, 0, observation, 2**63 + number, source.infer([observation], [0])[0])  # type: ignore[arg-type]
     assert visited.seen == 9 and len(visited.entries) == 4

@@ -11,7 +11,7 @@ import pytest
 from turbopi.evaluate.compare import cells, compare, document
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import Episode, PolicyTold, Results
+from turbopi.evaluate.results import Episode, PolicyDescription, Results
 from turbopi.sim import Task
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document
@@ -19,7 +19,7 @@ from turbopi.support.reading import plain_document
 
 def good(folder: Path) -> dict[str, Any]:
     """A document as a run writes it."""
-    policy = PolicyTold("a policy", {"weights": "abc", "precision": "f32"}, {"robot": "libero"})
+    policy = PolicyDescription("a policy", {"weights": "abc", "precision": "f32"}, {"robot": "libero"})
     tasks = [Task(0, "red", "reach the red dot", 50, 80)]
     results = Results(folder, {"suite": "colors", "sim": {"seed": 7}}, policy, tasks, {"torch": "2"}, {"workers": 1})
     for state, status in enumerate(("success", "failure", "aborted", "crash")):
@@ -62,9 +62,9 @@ def test_what_was_written_is_read_again(tmp_path: Path) -> None:
 )
 def test_wrong_values_are_refused_by_key(change: dict[str, Any], why: str, tmp_path: Path) -> None:
     file = write(tmp_path, good(tmp_path) | change)
-    with pytest.raises(ConfigError, match=why) as told:
+    with pytest.raises(ConfigError, match=why) as reported:
         load_results(tmp_path)
-    assert str(told.value).startswith(str(file))
+    assert str(reported.value).startswith(str(file))
 
 
 @pytest.mark.parametrize(

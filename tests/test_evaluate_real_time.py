@@ -16,7 +16,7 @@ from turbopi.evaluate.checks import check_delay
 from turbopi.evaluate.delays import Cell, document, heads, make_cells, row, write_delays
 from turbopi.evaluate.episode import Ending, Execution, NoActions
 from turbopi.evaluate.frames import Frame
-from turbopi.evaluate.pacing import Paced, Pacer, rate_told, summarise_paced, told_of_lateness
+from turbopi.evaluate.pacing import Paced, Pacer, allows_for_lateness, rate_given, summarise_paced
 from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.real_time import _STEP, RealTimeLoop, Unfit, _Policy
@@ -105,7 +105,7 @@ class World:
 
     def observation(self) -> dict[str, Any]:
         assert self.seen, "the step before wasn't told to look"
-        return {"picture": np.full((2, 2, 3), len(self.actions), np.uint8), "count": len(self.actions)}
+        return {"image": np.full((2, 2, 3), len(self.actions), np.uint8), "count": len(self.actions)}
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         self.times.append(self.clock.now)
@@ -130,7 +130,7 @@ class Setup:
     ) -> None:
         self.clock = Clock()
         self.inference = Inference(self.clock)
-        self.asked: list[tuple[int | None, dict[str, Any], Mapping[str, Any]]] = []
+        self.requested: list[tuple[int | None, dict[str, Any], Mapping[str, Any]]] = []
         self.trouble: dict[int, BaseException] = {}  # by step
         self.slow: dict[int, float] = {}  # by step
         self.policy_s, self.warm_s = policy_s, policy_s if warm_s is None else warm_s
@@ -141,7 +141,7 @@ class Setup:
         self.inference.warming = lambda: not self.loop._warm
 
     def ask(self, step: int | None, observation: dict[str, Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
-        self.asked.append((step, observation, arguments))
+        self.requested.append((step, observation, arguments))
         self.inference.seconds = self.policy_s if step is None else self.slow.get(step, self.policy_s)
         if step is None:
             self.clock.now += self.warm_s
@@ -152,7 +152,7 @@ class Setup:
         return {"actions": chunk, "model_actions": chunk.astype(np.float32)}
 
     def run(self, world: World, steps: int = 20, **more: Any) -> Ending:
-        return self.loop.run(world, Job(TASK, 0), max_steps=steps, image_keys=("picture",), **more)
+        return self.loop.run(world, Job(TASK, 0), max_steps=steps, image_keys=("image",), **more)
 
 
 # --- the clock --------------------------------------------------------------------------------------------------------
@@ -173,10 +173,10 @@ def test_a_simulator_that_is_too_slow_is_late_and_the_clock_does_not_wait_for_it
     paced = setup.run(world, steps=10).paced
     assert paced is not None
     assert paced.late_ms == pytest.approx([10 * step for step in range(1, 10)])  # 10 ms more with each step
-    told = summarise_paced([(10, paced)], HZ)
-    assert told is not None and not told.is_real_time and told.late_steps == 9
-    assert told.speed == pytest.approx(50 / 60, abs=1e-3) and told.longest_step_ms == pytest.approx(60)
-    text = told_of_lateness(told, HZ)
+    reported = summarise_paced([(10, paced)], HZ)
+    assert reported is not None and not reported.is_real_time and reported.late_steps == 9
+    assert reported.speed == pytest.approx(50 / 60, abs=1e-3) and reported.longest_step_ms == pytest.approx(60)
+    text = allows_for_lateness(reported, HZ)
     assert text is not None and text.startswith("NOT REAL TIME. 9 of 10 control steps (90 %) began late, by 50.0 ms")
     assert "took 60.0 ms, where 20 Hz leaves 50.0 ms for one; the world's time ran at 0.833 of the clock's" in text
 
@@ -215,21 +215,21 @@ def test_a_machine_that_wakes_late_is_late_whoever_is_to_blame() -> None:
 
 
 def test_few_late_steps_are_told_and_many_make_it_no_real_time() -> None:
-    def told(late: int) -> str | None:
+    def reported(late: int) -> str | None:
         paced = Paced([1], [20.0], {}, [4.0] * late, (10.0, 54.0), 199 * STEP)
         summary = summarise_paced([(200, paced)], HZ)
         assert summary is not None
-        return told_of_lateness(summary, HZ)
+        return allows_for_lateness(summary, HZ)
 
-    assert told(0) is None
-    assert str(told(2)).startswith("2 of 200 control steps (1 %) began late, by 4.0 ms in the median")
-    assert str(told(3)).startswith("NOT REAL TIME.")
+    assert reported(0) is None
+    assert str(reported(2)).startswith("2 of 200 control steps (1 %) began late, by 4.0 ms in the median")
+    assert str(reported(3)).startswith("NOT REAL TIME.")
 
 
 def test_slow_motion_is_said() -> None:
-    assert rate_told(20, 20) == "20 control steps a second"
-    assert rate_told(10, 20) == "10 control steps a second, where the simulator's robot makes 20: slow motion"
-    assert rate_told(50, 20).endswith("fast motion")
+    assert rate_given(20, 20) == "20 control steps a second"
+    assert rate_given(10, 20) == "10 control steps a second, where the simulator's robot makes 20: slow motion"
+    assert rate_given(50, 20).endswith("fast motion")
 
 
 # --- the ways to run --------------------------------------------------------------------------------------------------
@@ -251,11 +251,11 @@ def test_the_delay_is_the_policys_time_in_control_steps(way: str, policy_s: floa
     assert ending.motion is not None and ending.motion.standing == delay
     assert ending.commands.seams[0] == len(first) and ending.motion.seams == len(ending.commands.seams)
     assert ending.motion.seam_jump == pytest.approx(second[0] - first[-1], rel=0.5)
-    told = [arguments["previous"] for step, _, arguments in setup.asked if step is not None and arguments]
+    reported = [arguments["previous"] for step, _, arguments in setup.requested if step is not None and arguments]
     if way == "async":
-        assert not told
+        assert not reported
     else:
-        assert told[0] is None and all(one.delay == delay and one.mode == way for one in told[1:])
+        assert reported[0] is None and all(one.delay == delay and one.mode == way for one in reported[1:])
 
 
 def test_sync_stands_still_while_the_policy_computes() -> None:
@@ -301,16 +301,16 @@ def test_the_warm_up_is_no_part_of_what_is_measured_and_happens_once() -> None:
     for episode in range(2):
         ending = setup.run(World(setup.clock), steps=9)
         assert ending.paced is not None and max(ending.paced.delays) == 1 and ending.paced.late_ms == []
-        assert sum(step is None for step, _, _ in setup.asked) == 3, episode
-    assert [step for step, _, _ in setup.asked[3:]] == [0, 5, 0, 5]  # from each first observation on
-    assert all(set(observation) == {"picture", "count"} for _, observation, _ in setup.asked)
+        assert sum(step is None for step, _, _ in setup.requested) == 3, episode
+    assert [step for step, _, _ in setup.requested[3:]] == [0, 5, 0, 5]  # from each first observation on
+    assert all(set(observation) == {"image", "count"} for _, observation, _ in setup.requested)
 
 
 def test_an_episode_is_not_given_the_answer_of_the_one_before() -> None:
     setup = Setup("async", policy_s=0.12)
     world = World(setup.clock)
     first = setup.run(world, steps=8)  # ends while a chunk is computed
-    assert first.paced is not None and len(first.paced.delays) == 1 and len(setup.asked) == 3 + 2
+    assert first.paced is not None and len(first.paced.delays) == 1 and len(setup.requested) == 3 + 2
     second = setup.run(world, steps=8)
     assert world.actions == [-1, -1, -1, 0, 1, 2, 3, 4]
     assert second.paced is not None and second.paced.delays == [3] and second.paced.dropped == {}
@@ -321,7 +321,7 @@ def test_actions_that_cannot_be_used_are_dropped_as_on_a_robot() -> None:
     setup.trouble = {5: NoActions("the model computed nan")}
     ending = setup.run(World(setup.clock), steps=12)
     assert ending.status == "failure" and ending.paced is not None and ending.paced.dropped == {"failed": 1}
-    assert [step for step, _, _ in setup.asked[3:]] == [0, 5, 6, 10]  # asked again with the next observation
+    assert [step for step, _, _ in setup.requested[3:]] == [0, 5, 6, 10]  # asked again with the next observation
 
 
 def test_latency_is_from_the_observation_to_the_policys_answer() -> None:
@@ -387,13 +387,13 @@ def test_pictures_are_drawn_only_where_the_policy_may_look() -> None:
 def test_a_film_shows_what_was_carried_out() -> None:
     setup = Setup("async", policy_s=0.07)
     frames: list[Frame] = []
-    setup.run(World(setup.clock), steps=10, film=frames.append)
+    setup.run(World(setup.clock), steps=10, on_frame=frames.append)
     assert [(frame.step, frame.entered, frame.planned, frame.done) for frame in frames] == [
         *((0, 0, 0, 0), (2, 0, 6, 0)),  # the robot waits for the first chunk; it takes over
         *((6, 0, 6, 4), (8, 2, 4, 2), (10, 2, 4, 4)),
     ]
     assert [frame.note[:6] for frame in frames] == ["stands", "", "the ne", "", ""]
-    assert all(frame.pictures[0][0, 0, 0] == frame.step for frame in frames)
+    assert all(frame.camera_images[0][0, 0, 0] == frame.step for frame in frames)
     assert frames[3].before[:, 0].tolist() == [4, 5] and frames[3].chunk[0, 0] == 600
 
 
@@ -414,11 +414,11 @@ def test_a_run_in_real_time_is_another_run_and_says_what_it_measured(tmp_path: P
         e.real_time is not None and e.motion is not None for e in results.in_order()
     )
     assert all(len(e.call_ms) >= len(e.real_time.delays) for e in results.in_order() if e.real_time)
-    told = document(done)
-    assert [cell.delay for cell in told.cells] == [None, None] and told.cells[1].against is not None
-    assert heads(told.cells)[-3:] == ("latency [ms] p50 / p95", "dropped", "late steps")
-    assert all(len(row(cell)) == len(heads(told.cells)) for cell in told.cells)
-    assert row(told.cells[0])[1].startswith("measured: ")
+    reported = document(done)
+    assert [cell.delay for cell in reported.cells] == [None, None] and reported.cells[1].against is not None
+    assert heads(reported.cells)[-3:] == ("latency [ms] p50 / p95", "dropped", "late steps")
+    assert all(len(row(cell)) == len(heads(reported.cells)) for cell in reported.cells)
+    assert row(reported.cells[0])[1].startswith("measured: ")
     text = write_delays(tmp_path, done).read_text()
     assert "<b>In real time</b>, 200 control steps a second, where the simulator" in text and "fast motion" in text
     page = (tmp_path / cells[0].folder / "report.html").read_text()
@@ -433,8 +433,8 @@ def test_a_report_says_that_a_simulator_ran_late(tmp_path: Path) -> None:
     late = Paced([1, 2], [20.0, 21.0], {"late": 1}, [7.0] * 4, (10.0, 27.0), 5 / 50)
     results.episodes[episode.key] = type(episode)(**{**_fields(episode), "real_time": late})
     write_delays(tmp_path, [(Cell("async", None, 5), results)])
-    told = json.loads((tmp_path / "delays.json").read_text())["cells"][0]["real_time"]
-    assert told["late_steps"] == 4 and told["dropped"] == {"late": 1} and told["delay_steps"]["p50"] == 1.5
+    reported = json.loads((tmp_path / "delays.json").read_text())["cells"][0]["real_time"]
+    assert reported["late_steps"] == 4 and reported["dropped"] == {"late": 1} and reported["delay_steps"]["p50"] == 1.5
     assert "async: NOT REAL TIME. 4 of" in (tmp_path / "delays.html").read_text()
 
 

@@ -50,13 +50,13 @@ def test_a_policy_that_sees_solves_every_episode(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_workers_requests_are_batched_which_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = gathering(monkeypatch, tmp_path / "gather", 3)
+    requested = gathering(monkeypatch, tmp_path / "gather", 3)
 
     class Slow(SeekingPolicy):
         """While it is at the first request, if that came alone, those of the other two workers come in."""
 
         def infer_batch(self, observations: Any, seed: Any) -> Any:
-            while not self.batches and len(observations) == 1 and asked() < 3:
+            while not self.batches and len(observations) == 1 and requested() < 3:
                 pass
             return super().infer_batch(observations, seed)
 

@@ -185,8 +185,8 @@ def test_what_a_server_tells_of_itself_fits_into_the_results(tmp_path: Path) -> 
         {"reset_pose": np.array([0.5, 1.0]), "robot": None, "precision": np.float32(2), "config": "\x1b[2J[/red]"}
     )
     with foreign(pose) as source:
-        told: Any = source.about["metadata"]
-        assert told | {"config": 0} == {
+        reported: Any = source.about["metadata"]
+        assert reported | {"config": 0} == {
             "reset_pose": [0.5, 1.0],
             "robot": None,
             "precision": 2.0,
@@ -223,9 +223,9 @@ CHUNK = {b"__ndarray__": True, b"data": b"\0" * 4, b"dtype": "<f4", b"shape": [1
     ],
 )
 def test_an_answer_without_usable_actions_is_one_line(reply: Any, why: str) -> None:
-    with foreign({}, reply) as source, pytest.raises(PolicyRefused, match=why) as told:
+    with foreign({}, reply) as source, pytest.raises(PolicyRefused, match=why) as reported:
         ask(source)
-    assert "\n" not in str(told.value) and len(str(told.value)) < 1000
+    assert "\n" not in str(reported.value) and len(str(reported.value)) < 1000
 
 
 @pytest.mark.parametrize(

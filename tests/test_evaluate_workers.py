@@ -43,14 +43,14 @@ def statuses(results: Results) -> list[str]:
 def test_a_worker_that_is_killed_while_its_request_waits_costs_its_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = gathering(monkeypatch, tmp_path / "gather", 3)
+    requested = gathering(monkeypatch, tmp_path / "gather", 3)
 
     class Killing(SeekingPolicy):
         """Its first call takes until the other two workers have asked, so that one of these waits in the second."""
 
         def infer_batch(self, observations: Sequence[dict[str, Any]], seed: Sequence[int]) -> list[dict[str, Any]]:
             if len(self.batches) == 0:
-                while asked() < 3:
+                while requested() < 3:
                     pass
             if len(self.batches) == 1:
                 kill_workers()
@@ -104,7 +104,7 @@ def test_a_state_that_is_nan_is_its_episodes_crash_and_the_others_go_on(executio
     )
 
 
-PICTURE = np.zeros((4, 4, 3), np.uint8)
+IMAGE = np.zeros((4, 4, 3), np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -112,13 +112,13 @@ PICTURE = np.zeros((4, 4, 3), np.uint8)
     [
         (None, "a NoneType; it should be a dict"),
         ({}, "no 'image'; it has nothing"),
-        ({"image": None}, "'image' is NoneType; a picture should be uint8"),
-        ({"image": PICTURE / 255}, "'image' is float64"),
-        ({"image": PICTURE[:0]}, r"'image' is uint8\[0, 4, 3\]"),
-        ({"image": PICTURE[..., :1]}, r"'image' is uint8\[4, 4, 1\]"),
-        ({"image": PICTURE[None]}, r"'image' is uint8\[1, 4, 4, 3\]"),
-        ({"image": PICTURE, "state": np.array([[0, np.inf]])}, r"'state' isn't finite: inf at \[0, 1\]"),
-        ({"image": PICTURE, "gripper": float("nan")}, "'gripper' isn't finite: nan"),
+        ({"image": None}, "'image' is NoneType; an image should be uint8"),
+        ({"image": IMAGE / 255}, "'image' is float64"),
+        ({"image": IMAGE[:0]}, r"'image' is uint8\[0, 4, 3\]"),
+        ({"image": IMAGE[..., :1]}, r"'image' is uint8\[4, 4, 1\]"),
+        ({"image": IMAGE[None]}, r"'image' is uint8\[1, 4, 4, 3\]"),
+        ({"image": IMAGE, "state": np.array([[0, np.inf]])}, r"'state' isn't finite: inf at \[0, 1\]"),
+        ({"image": IMAGE, "gripper": float("nan")}, "'gripper' isn't finite: nan"),
     ],
 )
 def test_what_no_policy_can_be_sent_is_named(observation: Any, why: str) -> None:
@@ -155,8 +155,10 @@ def test_what_a_simulator_of_ones_own_raises_is_no_fault_of_turbopi(tmp_path: Pa
     faulty: Any = Faulty()
     source = LocalPolicy(SeekingPolicy())
     protocol = Protocol("faulty", "reacher_colors", SimSettings())
-    told = turbopi("eval", "test_evaluate_workers:Faulty", "--random-weights", "pi05_tiny", "--out", tmp_path / "never")
-    assert "check() of the simulator faulty failed: TypeError" in refusal(told)
+    reported = turbopi(
+        "eval", "test_evaluate_workers:Faulty", "--random-weights", "pi05_tiny", "--out", tmp_path / "never"
+    )
+    assert "check() of the simulator faulty failed: TypeError" in refusal(reported)
     with pytest.raises(ConfigError, match=r"tasks\(\) of the simulator faulty failed: OSError: no such scene; --debug"):
         choose_tasks(faulty, "reacher_colors", None)
     with pytest.raises(ConfigError, match=r"versions\(\) of the simulator faulty failed: RuntimeError: no version"):

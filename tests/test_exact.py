@@ -130,13 +130,13 @@ def test_what_is_exact_is_left_alone() -> None:
 def test_the_last_of_several_threads_sets_them_back() -> None:
     """The first one in leaves first, while the second one still computes."""
     before = coarse()
-    inside, left, told = threading.Event(), threading.Event(), list[bool]()
+    inside, left, reported = threading.Event(), threading.Event(), list[bool]()
 
     def second() -> None:
         with exact_float32():
             inside.set()
             assert left.wait(30)
-            told.append(is_exact())
+            reported.append(is_exact())
 
     with exact_float32():
         thread = threading.Thread(target=second)
@@ -144,7 +144,7 @@ def test_the_last_of_several_threads_sets_them_back() -> None:
         assert inside.wait(30)
     left.set()
     thread.join(30)
-    assert told == [True]
+    assert reported == [True]
     assert what_is_set() == before
 
 
@@ -158,15 +158,17 @@ def test_a_switch_turned_during_a_call_is_turned_for_the_next_one() -> None:
 
 def test_the_float32_reference_asks_cudnn_for_nothing() -> None:
     """So its switches can't coarsen it: no convolution, no recurrent layer, no attention but our own."""
-    asked: list[str] = []
+    requested: list[str] = []
 
     class Watching(TorchDispatchMode):  # type: ignore[no-untyped-call]
         def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            asked.append(str(func))
+            requested.append(str(func))
             return func(*args, **(kwargs or {}))
 
     case = golden_cases()["b_third_masked"]
     with Watching():  # type: ignore[no-untyped-call]
         golden_model("pi05").sample(case.observation, case.noise, 1)
-    assert any("addmm" in name or "mm" in name for name in asked)
-    assert not [name for name in asked if any(word in name for word in ("conv", "cudnn", "scaled_dot", "rnn", "lstm"))]
+    assert any("addmm" in name or "mm" in name for name in requested)
+    assert not [
+        name for name in requested if any(word in name for word in ("conv", "cudnn", "scaled_dot", "rnn", "lstm"))
+    ]

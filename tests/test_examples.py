@@ -86,12 +86,12 @@ def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> N
     """The examples start it in the background, and the robot at once."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])  # free when it is closed
-    asked = {
+    requested = {
         "robot_loop.py": ("--host", "127.0.0.1", "--port", port),
         "real_time_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "300"),
         "lerobot_so101.py": ("--server", f"ws://127.0.0.1:{port}"),
     }
-    for name, where in asked.items():
+    for name, where in requested.items():
         with pytest.raises(AssertionError, match=r"no server answers at .*; start one with: turbopi serve") as failed:
             run(name, *where, "--patience", "0")
         assert "Traceback" not in str(failed.value)

@@ -94,17 +94,17 @@ def test_the_policy_is_told_what_runs(name: str, horizon: int, s: int, delays: l
     line.answer = noting  # type: ignore[method-assign]
     run(queue, line, delays, 60)
     for place, request in zip(places, line.requests, strict=True):
-        told = request.previous
-        if told is None:
+        reported = request.previous
+        if reported is None:
             continue
-        assert told.mode == name and told.execution_horizon is not None
-        np.testing.assert_array_equal(told.left_over[:, 0], place + np.arange(len(told.left_over)))
-        assert told.left_over.dtype == np.float32 and 1 <= len(told.left_over) <= horizon
-        assert 0 <= told.delay <= horizon - told.execution_horizon <= len(told.left_over)
-        assert told.execution_horizon >= s
-        assert told.anchor is not None and told.anchor[0] < request.number
+        assert reported.mode == name and reported.execution_horizon is not None
+        np.testing.assert_array_equal(reported.left_over[:, 0], place + np.arange(len(reported.left_over)))
+        assert reported.left_over.dtype == np.float32 and 1 <= len(reported.left_over) <= horizon
+        assert 0 <= reported.delay <= horizon - reported.execution_horizon <= len(reported.left_over)
+        assert reported.execution_horizon >= s
+        assert reported.anchor is not None and reported.anchor[0] < request.number
         if name == "rtc_trained" and most is not None:
-            assert told.delay <= most
+            assert reported.delay <= most
 
 
 @given(horizon=st.integers(2, 16), s=st.integers(1, 16), d=st.integers(0, 16), name=st.sampled_from(ASYNC))
@@ -120,7 +120,7 @@ def test_a_delay_that_fits_leaves_no_step_without_an_action(horizon: int, s: int
     assert [request.step for request in line.requests[1:4]] == [d + s + i * s for i in range(3)]
     for seam in queue.seams:
         assert seam.delay == seam.carried_out == d
-        assert seam.told == (d if name in RTC else None)
+        assert seam.reported == (d if name in RTC else None)
         assert seam.jump == pytest.approx([1.0])
         assert (seam.gap is None) == (d + s == horizon)  # the running chunk has just ended
         assert seam.gap is None or seam.gap == pytest.approx([0.0])

@@ -107,9 +107,9 @@ def test_a_full_disk_keeps_the_earlier_file_and_names_it(writer: str, room: int,
     ending = f".{writer}" if writer in ("png", "svg", "pdf") else ""
     file = tmp_path / f"result{ending}"
     file.write_text("earlier")
-    with no_room(room), pytest.raises(OutputError) as told:
+    with no_room(room), pytest.raises(OutputError) as reported:
         WRITERS[writer](file)
-    assert str(told.value) == f"can't write {file}: File too large; make room, or write to another place"
+    assert str(reported.value) == f"can't write {file}: File too large; make room, or write to another place"
     assert file.read_text() == "earlier" and names(tmp_path) == [file.name]
 
 
@@ -147,9 +147,9 @@ def test_whatever_ends_the_writing_leaves_the_earlier_file(tmp_path: Path) -> No
             stream.write(b"half")
             raise reason
 
-        with pytest.raises(type(reason)) as told:
+        with pytest.raises(type(reason)) as reported:
             write_whole(file, stop)
-        assert told.value is reason
+        assert reported.value is reason
         assert file.read_text() == "earlier" and names(tmp_path) == ["result"]
 
 
@@ -177,18 +177,18 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
 def test_messages_name_the_file_the_reason_and_are_of_the_callers_class(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=f"^can't write {tmp_path}/no/file: there is no folder {tmp_path}/no$"):
         write_whole(tmp_path / "no" / "file", "", CheckpointError)
-    with pytest.raises(OutputError, match=f"^can't write {tmp_path}: Is a directory$") as told:
+    with pytest.raises(OutputError, match=f"^can't write {tmp_path}: Is a directory$") as reported:
         write_whole(tmp_path, "")
-    assert isinstance(told.value, OSError)
+    assert isinstance(reported.value, OSError)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=f"^can't write {tmp_path}/file/below: there is no folder {tmp_path}/file$"):
         write_whole(tmp_path / "file" / "below", "")
 
 
 def test_a_fault_of_another_file_is_told_as_that_files(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="another") as told:
+    with pytest.raises(FileNotFoundError, match="another") as reported:
         write_whole(tmp_path / "result", lambda stream: stream.write((tmp_path / "sub" / "another").read_bytes()))
-    assert not isinstance(told.value, OutputError) and names(tmp_path) == []
+    assert not isinstance(reported.value, OutputError) and names(tmp_path) == []
 
 
 def test_permissions_and_links_stay(tmp_path: Path) -> None:
@@ -248,11 +248,11 @@ def test_of_many_writers_at_once_none_fails_and_readers_find_a_whole_file(tmp_pa
 
 
 def test_a_path_that_another_writer_fills_becomes_the_file(tmp_path: Path) -> None:
-    with new_file(tmp_path / "film.mp4", ending=".mp4") as temporary:
+    with new_file(tmp_path / "video.mp4", ending=".mp4") as temporary:
         temporary.write_text("frames")
-        assert names(tmp_path) == [temporary.name] and temporary.name.startswith(".film.mp4.")
+        assert names(tmp_path) == [temporary.name] and temporary.name.startswith(".video.mp4.")
         assert temporary.suffix == ".mp4"
-    assert names(tmp_path) == ["film.mp4"]
+    assert names(tmp_path) == ["video.mp4"]
 
 
 # -- folders -----------------------------------------------------------------------------------------------------------

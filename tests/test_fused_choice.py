@@ -27,10 +27,10 @@ GPU = torch.device("cuda", 0)
 MATRICES = ("qkv", "out", "gate_up", "down")
 
 
-class TwinKernel:
+class ReferenceKernel:
     """Stands for `DenoiseKernel`: the same arguments and results, computed from the packed matrices in PyTorch."""
 
-    made: list["TwinKernel"]
+    made: list["ReferenceKernel"]
     refuse: str | None
 
     def __init__(
@@ -120,9 +120,9 @@ class OnCpu(FusedBackend):
 
 
 @pytest.fixture
-def kernels(monkeypatch: pytest.MonkeyPatch) -> type[TwinKernel]:
+def kernels(monkeypatch: pytest.MonkeyPatch) -> type[ReferenceKernel]:
     """The class of kernels that the backend makes; `made` and `refuse` are this test's own."""
-    cls = type("Kernel", (TwinKernel,), {"made": [], "refuse": None})
+    cls = type("Kernel", (ReferenceKernel,), {"made": [], "refuse": None})
     monkeypatch.setattr(denoise, "DenoiseKernel", cls)
     monkeypatch.setattr(denoise, "unavailable", lambda device: None)
     return cls
@@ -140,7 +140,9 @@ def actions(backend: FusedBackend, steps: int = 3, horizon: int = 10) -> Tensor:
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_the_kernel_and_the_operations_give_the_references_actions(kernels: type[TwinKernel], refused: bool) -> None:
+def test_the_kernel_and_the_operations_give_the_references_actions(
+    kernels: type[ReferenceKernel], refused: bool
+) -> None:
     kernels.refuse = "the GPU is too small" if refused else None
     backend, case = fused(), golden_cases()["b_third_masked"]
     expected = golden_model("pi05").sample(case.observation, case.noise, 3)
@@ -152,49 +154,49 @@ def test_the_kernel_and_the_operations_give_the_references_actions(kernels: type
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", BY_TOKEN)
-def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[TwinKernel], which: str) -> None:
+def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[ReferenceKernel], which: str) -> None:
     backend, case = fused(), golden_cases()["b_third_masked"]
-    asked = conditioned(which, 3, *case.noise.shape[1:])
-    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=asked)
-    found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
+    requested = conditioned(which, 3, *case.noise.shape[1:])
+    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=requested)
+    found = backend.sample(case.observation, case.noise, 3, conditioning=requested).actions
     torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
-    ((told, (call,)),) = backend.describe()["denoising"].items()
-    assert told == "one CUDA kernel" and call.startswith("H=10, 3 steps, by token, ")
+    ((reported, (call,)),) = backend.describe()["denoising"].items()
+    assert reported == "one CUDA kernel" and call.startswith("H=10, 3 steps, by token, ")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["kernel", "refused", "operations"])
 def test_the_true_jacobian_goes_forward_in_a_kernel_and_back_by_operations_that_find_the_expert_there(
-    kernels: type[TwinKernel], how: str, monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if how == "operations":  # sizes that the way back's kernels for few tokens don't take
         monkeypatch.setattr("turbopi.kernels.portable.vjp.tiles.takes", lambda expert, tokens: False)
     backend, case = fused(), golden_cases()["b_third_masked"]
     plain = actions(backend)
-    asked = conditioned("jacobian", 3, *case.noise.shape[1:])
-    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=asked)
+    requested = conditioned("jacobian", 3, *case.noise.shape[1:])
+    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=requested)
     kernels.refuse = "too small" if how == "refused" else None
     for _ in range(2):
-        found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
+        found = backend.sample(case.observation, case.noise, 3, conditioning=requested).actions
         torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
     kernels.refuse = None
     launches = [kernel.launches for kernel in kernels.made]  # one at its capture, a step a launch
     assert launches == ([2, 3 * 3] if how == "kernel" else [2])
-    told = backend.describe()["denoising"]
-    assert told["one CUDA kernel"] == ["H=10, 3 steps"]
+    reported = backend.describe()["denoising"]
+    assert reported["one CUDA kernel"] == ["H=10, 3 steps"]
     reason = "operations, as the denoising kernel has no way back, which the true Jacobian takes"
     if how == "kernel":
         reason = "one CUDA kernel a step forward, operations back"
-    assert told[reason] == ["H=10, 3 steps, guided by the Jacobian, 4 times"]
+    assert reported[reason] == ["H=10, 3 steps, guided by the Jacobian, 4 times"]
     assert torch.equal(actions(backend), plain)
 
 
 def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_expert(
-    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    backend, tried = fused(), list[TwinKernel | None]()
+    backend, tried = fused(), list[ReferenceKernel | None]()
 
-    def make(*given: Any, **options: Any) -> TwinKernel:
+    def make(*given: Any, **options: Any) -> ReferenceKernel:
         tried.append(None)
         return kernels(*given, **options)
 
@@ -205,7 +207,7 @@ def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_
     assert len(tried) == 1 and not backend._expert.users["packed"] and not backend._expert._built
 
 
-def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
+def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[ReferenceKernel]) -> None:
     backend = fused()
     for steps, horizon in ((3, 10), (3, 6), (2, 10), (3, 10)):
         actions(backend, steps, horizon)
@@ -219,7 +221,7 @@ def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[
     )
 
 
-def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
+def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[ReferenceKernel]) -> None:
     backend = fused()
     table = backend._table(EulerLoop(2, 10))
     for cameras in (1, 2, 3, 4):
@@ -229,7 +231,7 @@ def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]
 
 
 def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_and_says_why(
-    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pi0 = fused("pi0")
     actions(pi0)
@@ -240,14 +242,14 @@ def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_
     assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, denoise.MAX_SUFFIX + 1)), table) is None
     monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
     assert backend._make_denoiser(CallShape(3, 16, EulerLoop(2, 9)), table) is None
-    told = backend.describe()["denoising"]
-    assert told["one CUDA kernel"] == ["H=56, 2 steps"]
-    assert told["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
-    assert told["operations, as this GPU has 12.0"] == ["H=9, 2 steps"]
+    reported = backend.describe()["denoising"]
+    assert reported["one CUDA kernel"] == ["H=56, 2 steps"]
+    assert reported["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
+    assert reported["operations, as this GPU has 12.0"] == ["H=9, 2 steps"]
 
 
 def test_an_error_of_the_kernel_that_is_no_refusal_is_no_reason_for_operations(
-    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*args: Any, **options: Any) -> None:
         raise RuntimeError("CUDA error: unspecified launch failure")
@@ -258,7 +260,7 @@ def test_an_error_of_the_kernel_that_is_no_refusal_is_no_reason_for_operations(
 
 
 def test_a_trapped_kernel_is_asked_why_and_the_advice_is_given(
-    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     backend = fused()
     actions(backend)
@@ -289,7 +291,7 @@ class Placed:
 class OnFakeGpu:
     """A backend whose device is a GPU, and its loops; `places` are those of all matrices of the expert."""
 
-    def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
         self.table = self.backend._table(EulerLoop(2, 10))
         self.backend.device = self.backend._expert._device = GPU
@@ -318,7 +320,7 @@ class OnFakeGpu:
 
 
 @pytest.fixture
-def gpu(kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> OnFakeGpu:
+def gpu(kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch) -> OnFakeGpu:
     return OnFakeGpu(kernels, monkeypatch)
 
 

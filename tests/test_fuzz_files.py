@@ -31,7 +31,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.cli.files import load_noise
 from turbopi.config import LIMITS, preset
 from turbopi.evaluate.reading import load_results
-from turbopi.evaluate.results import Episode, PolicyTold, Results
+from turbopi.evaluate.results import Episode, PolicyDescription, Results
 from turbopi.evaluate.visited import Visited
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -121,7 +121,7 @@ def _results(folder: Path) -> None:
     results = Results(
         folder,
         {"simulator": "reacher", "suite": "reacher", "sim": {"seed": 7}, "replan": 5},
-        PolicyTold("tiny", {"precision": "bf16"}, {"backend_details": {}}),
+        PolicyDescription("tiny", {"precision": "bf16"}, {"backend_details": {}}),
         [Task(0, "reach", "reach the target", 3, 20)],
         {"simulator": {"name": "reacher"}},
         {"workers": 1},
@@ -296,7 +296,7 @@ TARGETS = (
     Target("tokenizer", _file("tokenizer.model", lambda f: shutil.copy(TINY_TOKENIZER, f)), "tokenizer.model", _tokens,
            _as_bytes, 120),
     Target("observation.json", _by_hand, "observation.json", lambda f: _arrays(load_observation(f)), _as_json, 200),
-    Target("picture", _by_hand, "a.png", lambda f: load_observation(f)["prompt"], _as_bytes, 150),
+    Target("image", _by_hand, "a.png", lambda f: load_observation(f)["prompt"], _as_bytes, 150),
     Target("array", _by_hand, "a.npy", lambda f: load_observation(f)["prompt"], _as_bytes, 150),
     Target("observation.npz", lambda f: np.savez_compressed(f / "a.npz", **_observation()), "a.npz",
            lambda f: _arrays(load_observation(f / "a.npz")), _as_bytes, 400, exact=True),

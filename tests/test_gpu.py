@@ -224,10 +224,10 @@ def test_pictures_of_any_size_give_the_actions_of_pictures_resized_on_the_host(n
     row, graphs = HostRow.of(observation, 0), len(runner._graphs.entries)
     sizes = ((480, 640), (37, 53), (side, side), (720, 1280), (480, 640))
     for first, second in itertools.pairwise((*sizes, *sizes)):
-        pictures = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in (first, second)]
-        on_host = runner.begin([fitted(one, side, way) for one in pictures])
+        camera_images = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in (first, second)]
+        on_host = runner.begin([fitted(one, side, way) for one in camera_images])
         expected = on_host.finish(row.tokens, row.state, noise[0].numpy(), 3).actions
-        found = runner.begin(pictures, way).finish(row.tokens, row.state, noise[0].numpy(), 3)
+        found = runner.begin(camera_images, way).finish(row.tokens, row.state, noise[0].numpy(), 3)
         assert torch.equal(found.actions, expected), (first, second)
         assert all(milliseconds > 0 for milliseconds in found.stage_ms.values()), found.stage_ms
     assert len(runner._graphs.entries) == graphs
@@ -264,17 +264,17 @@ def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecisi
     """Plain calls beside them keep their bits."""
     runner: Any = backend(name, kind, precision)
     observation, noise = made_up(kind, 2, 19)
-    asked = conditioned(which, 10, noise.shape[1], noise.shape[2])
+    requested = conditioned(which, 10, noise.shape[1], noise.shape[2])
     plain = runner.sample(observation, noise, 10).actions
-    exact = golden_model(kind).sample(observation, noise, 10, conditioning=asked)
-    found = runner.sample(observation, noise, 10, conditioning=asked).actions
+    exact = golden_model(kind).sample(observation, noise, 10, conditioning=requested)
+    found = runner.sample(observation, noise, 10, conditioning=requested).actions
     if precision == "f32":
         torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
     else:
-        reference = golden_model(kind, "bf16").sample(observation, noise, 10, conditioning=asked)
+        reference = golden_model(kind, "bf16").sample(observation, noise, 10, conditioning=requested)
         assert 0 < rms(found - exact) <= 2 * rms(reference - exact)
-    if asked.held is not None and asked.values is not None:
-        np.testing.assert_array_equal(found[0].numpy()[asked.held], asked.values[asked.held])
+    if requested.held is not None and requested.values is not None:
+        np.testing.assert_array_equal(found[0].numpy()[requested.held], requested.values[requested.held])
     assert torch.equal(runner.sample(observation, noise, 10).actions, plain)
 
 
@@ -288,7 +288,7 @@ class ConditionedRow:
 
     observation: Observation
     noise: torch.Tensor  # [1, 10, 32]
-    asked: Conditioning | None
+    requested: Conditioning | None
     exact: torch.Tensor  # [10, 32], in float32
     error: float
 
@@ -297,17 +297,17 @@ class ConditionedRow:
     def of(cls, row: int, form: str | None) -> "ConditionedRow":
         observation = golden_cases()[("a_three_cams", "b_third_masked")[row % 2]].observation
         noise = torch.randn(1, 10, 32, generator=torch.Generator().manual_seed(100 + row))
-        asked = None if form is None else conditioned(form, 5, 10, 32, row)
+        requested = None if form is None else conditioned(form, 5, 10, 32, row)
 
         def sample(precision: FloatPrecision, near: torch.Tensor) -> torch.Tensor:
-            return golden_model("pi05", precision).sample(observation, near, 5, conditioning=asked)[0]
+            return golden_model("pi05", precision).sample(observation, near, 5, conditioning=requested)[0]
 
         errors = []
         for seed in range(6):
             jitter = torch.randn(noise.shape, generator=torch.Generator().manual_seed(seed))
             near = noise * (1 + 1e-4 * jitter)
             errors.append(rms(sample("bf16", near) - sample("f32", near)))
-        return cls(observation, noise, asked, sample("f32", noise), float(np.sqrt(np.mean(np.square(errors)))))
+        return cls(observation, noise, requested, sample("f32", noise), float(np.sqrt(np.mean(np.square(errors)))))
 
 
 @pytest.mark.parametrize("name", [*GRAPHS, PORTABLE])
@@ -319,23 +319,23 @@ def test_a_batch_of_conditioned_observations_equals_its_rows(name: str, count: i
     rows = [ConditionedRow.of(row, form) for row, form in enumerate(forms[:count])]
     fields = [field.name for field in dataclasses.fields(Observation)]
     batch = Observation(**{field: torch.cat([getattr(row.observation, field) for row in rows]) for field in fields})
-    noise, asked = torch.cat([row.noise for row in rows]), [row.asked for row in rows]
+    noise, requested = torch.cat([row.noise for row in rows]), [row.requested for row in rows]
     runner: Any = backend(name, "pi05", "bf16")
     plain = runner.sample(batch, noise, 5).actions
-    together = runner.sample(batch, noise, 5, conditioning=asked).actions
-    assert torch.equal(runner.sample(batch, noise, 5, conditioning=asked).actions, together)
+    together = runner.sample(batch, noise, 5, conditioning=requested).actions
+    assert torch.equal(runner.sample(batch, noise, 5, conditioning=requested).actions, together)
     assert torch.equal(runner.sample(batch, noise, 5).actions, plain)
     errors, apart = [], []  # in units of the reference's own
     for row, found in zip(rows, together, strict=True):
-        alone = runner.sample(row.observation, row.noise, 5, conditioning=row.asked).actions[0]
+        alone = runner.sample(row.observation, row.noise, 5, conditioning=row.requested).actions[0]
         errors.append(rms(found - row.exact) / row.error)
         apart.append(rms(found - alone) / row.error)
-        if row.asked is not None and row.asked.held is not None and row.asked.values is not None:
-            np.testing.assert_array_equal(found.numpy()[row.asked.held], row.asked.values[row.asked.held])
+        if row.requested is not None and row.requested.held is not None and row.requested.values is not None:
+            np.testing.assert_array_equal(found.numpy()[row.requested.held], row.requested.values[row.requested.held])
     assert np.max(errors) <= 3 and np.mean(np.square(errors)) <= 1.5**2, errors
     assert np.max(apart) <= 4 and np.mean(np.square(apart)) <= 2**2, apart
     loop = "by token" if which == "by token" else "guided by the Jacobian"
-    assert any("observations" in told and loop in told for told in runner.describe()["batches"])
+    assert any("observations" in reported and loop in reported for reported in runner.describe()["batches"])
 
 
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
@@ -345,11 +345,11 @@ def test_a_conditioned_batch_in_float32_is_the_references(kind: Kind, which: str
     one, noise = made_up(kind, 2, 19)
     other, _ = made_up(kind, 1, 7, seed=1)
     both = Observation(**{field: torch.cat((getattr(one, field), getattr(other, field))) for field in vars(one)})
-    asked = [conditioned(which, 5, 7, 32, seed) for seed in range(2)]
-    exact = golden_model(kind).sample(both, noise.repeat(2, 1, 1), 5, conditioning=asked)
-    found = runner.sample(both, noise.repeat(2, 1, 1), 5, conditioning=asked).actions
+    requested = [conditioned(which, 5, 7, 32, seed) for seed in range(2)]
+    exact = golden_model(kind).sample(both, noise.repeat(2, 1, 1), 5, conditioning=requested)
+    found = runner.sample(both, noise.repeat(2, 1, 1), 5, conditioning=requested).actions
     torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
-    assert any(told.startswith("2 observations") for told in runner.describe()["batches"])
+    assert any(reported.startswith("2 observations") for reported in runner.describe()["batches"])
 
 
 @pytest.mark.parametrize("name", GRAPHS)
@@ -371,13 +371,13 @@ def test_conditioned_chunks_that_are_too_long_for_the_kernel_are_right_every_tim
     runner: Any = backend("fused", "pi05", "bf16")
     observation, _ = made_up("pi05", 2, 19)
     noise = torch.randn(1, 60, 32, generator=torch.Generator().manual_seed(0))
-    asked = conditioned(which, 5, 60, 32)
-    exact = golden_model("pi05").sample(observation, noise, 5, conditioning=asked)
-    reference = golden_model("pi05", "bf16").sample(observation, noise, 5, conditioning=asked)
-    first = runner.sample(observation, noise, 5, conditioning=asked).actions
+    requested = conditioned(which, 5, 60, 32)
+    exact = golden_model("pi05").sample(observation, noise, 5, conditioning=requested)
+    reference = golden_model("pi05", "bf16").sample(observation, noise, 5, conditioning=requested)
+    first = runner.sample(observation, noise, 5, conditioning=requested).actions
     assert rms(first - exact) <= 2 * rms(reference - exact)
     for _ in range(20):
-        assert torch.equal(runner.sample(observation, noise, 5, conditioning=asked).actions, first)
+        assert torch.equal(runner.sample(observation, noise, 5, conditioning=requested).actions, first)
 
 
 def rms(x: torch.Tensor) -> float:

@@ -62,7 +62,7 @@ def backend(kind: Kind, precision: Precision, target: float = 0.0, kernels: str 
 
 
 def emulated(
-    case: Case, precision: Precision, target: float, asked: Conditioning | None = None, expert: bool = True
+    case: Case, precision: Precision, target: float, requested: Conditioning | None = None, expert: bool = True
 ) -> tuple[Tensor, Tensor]:
     """(float32, float32 with the plan's sites rounded, the expert's among them), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
@@ -75,9 +75,9 @@ def emulated(
     }
     weights = RoundedWeights({site: plan.directions[str(site)] for site in used})
     observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
-    exact = model.sample(observation, noise, STEPS, conditioning=asked)
+    exact = model.sample(observation, noise, STEPS, conditioning=requested)
     with rounded(model, used, weights):
-        return exact.cpu(), model.sample(observation, noise, STEPS, conditioning=asked).cpu()
+        return exact.cpu(), model.sample(observation, noise, STEPS, conditioning=requested).cpu()
 
 
 @pytest.mark.parametrize("kernels", ["auto", "portable"])
@@ -113,11 +113,11 @@ def test_a_batch_is_as_far_from_float32_as_its_emulation(kernels: str) -> None:
 @pytest.mark.parametrize("case", ["b_third_masked", "e_horizon50"])
 def test_conditioned_calls_are_as_far_from_float32_as_their_emulation(case: str, which: str) -> None:
     one = golden_cases()[case]
-    asked = conditioned(which, STEPS, *one.noise.shape[1:])
-    exact, expected = emulated(one, "fp8", 0.0, asked)
+    requested = conditioned(which, STEPS, *one.noise.shape[1:])
+    exact, expected = emulated(one, "fp8", 0.0, requested)
     runner: Any = backend(one.kind, "fp8")
-    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=asked).actions
-    free = torch.ones(ours.shape[1], dtype=torch.bool) if asked.held is None else ~torch.from_numpy(asked.held)
+    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=requested).actions
+    free = torch.ones(ours.shape[1], dtype=torch.bool) if requested.held is None else ~torch.from_numpy(requested.held)
     ours, exact, expected = ours[:, free], exact[:, free], expected[:, free]
     assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
@@ -128,15 +128,15 @@ def test_conditioned_calls_are_as_far_from_float32_as_their_emulation(case: str,
 def test_a_conditioned_batch_is_as_far_from_float32_as_its_emulation(which: str, kernels: str) -> None:
     """Beside a plain row, which is as far as without them."""
     one = golden_cases()["b_third_masked"]
-    asked = conditioned(which, STEPS, *one.noise.shape[1:])
+    requested = conditioned(which, STEPS, *one.noise.shape[1:])
     four = Observation(
         **{name: value.repeat(4, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
     )
     runner: Any = backend("pi05", "fp8", kernels=kernels)
-    told = [asked, None, asked, asked]
-    ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS, conditioning=told).actions
+    reported = [requested, None, requested, requested]
+    ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS, conditioning=reported).actions
     assert any("4 observations" in batch and "by token" in batch for batch in runner.describe()["batches"])
-    for row, how in zip(ours, told, strict=True):
+    for row, how in zip(ours, reported, strict=True):
         exact, expected = emulated(one, "fp8", 0.0, how)
         free = torch.ones(len(row), dtype=torch.bool)
         if how is not None and how.held is not None:
@@ -148,13 +148,13 @@ def test_a_conditioned_batch_is_as_far_from_float32_as_its_emulation(which: str,
 
 def test_beside_fp8_batches_guided_by_the_jacobian_go_through_the_bf16_expert_and_say_so() -> None:
     one = golden_cases()["b_third_masked"]
-    asked = conditioned("jacobian", STEPS, *one.noise.shape[1:])
+    requested = conditioned("jacobian", STEPS, *one.noise.shape[1:])
     two = Observation(
         **{name: value.repeat(2, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
     )
     runner: Any = backend("pi05", "fp8")
-    ours = runner.sample(two, one.noise.repeat(2, 1, 1), STEPS, conditioning=asked).actions
-    exact, expected = emulated(one, "fp8", 0.0, asked, expert=False)
+    ours = runner.sample(two, one.noise.repeat(2, 1, 1), STEPS, conditioning=requested).actions
+    exact, expected = emulated(one, "fp8", 0.0, requested, expert=False)
     for row in ours:
         assert relative_rms(row[None], exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert "expert of batches guided by the Jacobian" in runner.describe()["fp8"]["plan"]
@@ -162,10 +162,10 @@ def test_beside_fp8_batches_guided_by_the_jacobian_go_through_the_bf16_expert_an
 
 def test_beside_fp8_the_true_jacobian_goes_through_the_bf16_expert_and_says_so() -> None:
     one = golden_cases()["b_third_masked"]
-    asked = conditioned("jacobian", STEPS, *one.noise.shape[1:])
+    requested = conditioned("jacobian", STEPS, *one.noise.shape[1:])
     runner: Any = backend("pi05", "fp8")
-    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=asked).actions
-    exact, expected = emulated(one, "fp8", 0.0, asked, expert=False)
+    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=requested).actions
+    exact, expected = emulated(one, "fp8", 0.0, requested, expert=False)
     # the way back multiplies each rounding five times, so that two ways to round don't come near each other
     assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert any("no way back" in why for why in runner.describe()["denoising"])

@@ -32,16 +32,16 @@ def test_a_solvers_loop_is_the_references(name: str, precision: FloatPrecision, 
     plain = runner.sample(observation, noise, 3).actions
     for times in (UNEVEN, tuple(0.6 * t for t in UNEVEN)):
         integration = Integration(solver, times)
-        asked, steps = Conditioning(integration=integration), integration.evaluations
-        exact = golden_model(kind).sample(observation, noise, steps, conditioning=asked)
-        found = runner.sample(observation, noise, steps, conditioning=asked).actions
+        requested, steps = Conditioning(integration=integration), integration.evaluations
+        exact = golden_model(kind).sample(observation, noise, steps, conditioning=requested)
+        found = runner.sample(observation, noise, steps, conditioning=requested).actions
         if precision == "f32":
             torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
         else:
-            reference = golden_model(kind, "bf16").sample(observation, noise, steps, conditioning=asked)
+            reference = golden_model(kind, "bf16").sample(observation, noise, steps, conditioning=requested)
             assert 0 < rms(found - exact) <= 2 * rms(reference - exact)
         for _ in range(3):
-            assert torch.equal(runner.sample(observation, noise, steps, conditioning=asked).actions, found)
+            assert torch.equal(runner.sample(observation, noise, steps, conditioning=requested).actions, found)
     assert torch.equal(runner.sample(observation, noise, 3).actions, plain)
 
 
@@ -49,10 +49,10 @@ def test_a_solvers_loop_is_the_references(name: str, precision: FloatPrecision, 
 def test_the_denoising_kernel_does_every_evaluation(name: str) -> None:
     runner: Any = backend(name, "pi05", "bf16")
     observation, noise = made_up("pi05", 1, 7)
-    asked = Conditioning(integration=Integration("exponential", UNEVEN))
-    runner.sample(observation, noise, 3, conditioning=asked)
-    told = runner.describe()["denoising"]
-    loops = {how: [loop for loop in these if loop.startswith("H=7, 1 steps, ")] for how, these in told.items()}
+    requested = Conditioning(integration=Integration("exponential", UNEVEN))
+    runner.sample(observation, noise, 3, conditioning=requested)
+    reported = runner.describe()["denoising"]
+    loops = {how: [loop for loop in these if loop.startswith("H=7, 1 steps, ")] for how, these in reported.items()}
     assert [how for how, these in loops.items() if these] in (["one CUDA kernel"], ["one portable CUDA kernel"])
 
 
@@ -60,12 +60,12 @@ def test_the_denoising_kernel_does_every_evaluation(name: str) -> None:
 def test_intermediates_of_a_solvers_loop_are_the_references(name: str) -> None:
     runner: Any = backend(name, "pi05", "bf16")
     observation, noise = made_up("pi05", 2, 19)
-    asked = Conditioning(integration=Integration("ab2", UNEVEN))
+    requested = Conditioning(integration=Integration("ab2", UNEVEN))
     exact: dict[str, torch.Tensor] = {}
     rounded: dict[str, torch.Tensor] = {}
-    golden_model("pi05").sample(observation, noise, 3, conditioning=asked, trace=exact)
-    golden_model("pi05", "bf16").sample(observation, noise, 3, conditioning=asked, trace=rounded)
-    found = runner.intermediates(observation, noise, 3, conditioning=asked)
+    golden_model("pi05").sample(observation, noise, 3, conditioning=requested, trace=exact)
+    golden_model("pi05", "bf16").sample(observation, noise, 3, conditioning=requested, trace=rounded)
+    found = runner.intermediates(observation, noise, 3, conditioning=requested)
     for tensor in ("v_t", "x_t"):
         ours, theirs = (rms(one[tensor].cpu() - exact[tensor]) for one in (found, rounded))
         assert 0 < ours <= 2 * theirs, tensor

@@ -66,26 +66,26 @@ def test_a_row_of_a_loops_table_has_a_time_and_loops_of_two_kinds_are_never_one(
 
 
 def test_the_least_recently_used_loop_goes() -> None:
-    gone: list[Loop] = []
-    recent = LoopCache(gone.append)
+    lost: list[Loop] = []
+    recent = LoopCache(lost.append)
     for steps in range(1, MOST_LOOPS + 1):
         recent.use(EulerLoop(steps, 10))
     recent.use(EulerLoop(1, 10))
-    assert gone == []
+    assert lost == []
     recent.use(EulerLoop(MOST_LOOPS + 1, 10))
     recent.use(EulerLoop(2, 50))
-    assert gone == [EulerLoop(2, 10), EulerLoop(3, 10)]
+    assert lost == [EulerLoop(2, 10), EulerLoop(3, 10)]
     assert list(recent)[-2:] == [EulerLoop(MOST_LOOPS + 1, 10), EulerLoop(2, 50)] and EulerLoop(1, 10) in list(recent)
     assert recent.describe()["forgotten"] == 2 and recent.describe()["denoising_loops"][-1] == "H=50, 2 steps"
 
 
 def test_many_steps_leave_room_for_few_loops() -> None:
     """1.27 MB a step: all together stay at some 1.3 GB."""
-    gone: list[Loop] = []
-    recent = LoopCache(gone.append)
+    lost: list[Loop] = []
+    recent = LoopCache(lost.append)
     for steps in (10, 5, 1000, 20, 500):
         recent.use(EulerLoop(steps, 10))
-    assert gone == [EulerLoop(10, 10), EulerLoop(5, 10), EulerLoop(1000, 10)]
+    assert lost == [EulerLoop(10, 10), EulerLoop(5, 10), EulerLoop(1000, 10)]
     assert fit(recent) and sum(loop.steps for loop in recent) <= MOST_STEPS
     recent.use(EulerLoop(1000, 10))
     assert EulerLoop(1000, 10) in list(recent)
@@ -150,19 +150,19 @@ def test_what_is_forgotten_is_freed() -> None:
 
 
 def test_a_loop_of_its_own_outlives_a_solvers_loop_with_the_same_evaluation() -> None:
-    gone: list[Loop] = []
-    loops, solver = LoopCache(gone.append), SolverLoop(2, 7, Integration("ab2", (1.0, 0.5, 0.0)))
+    lost: list[Loop] = []
+    loops, solver = LoopCache(lost.append), SolverLoop(2, 7, Integration("ab2", (1.0, 0.5, 0.0)))
     mine, *others = solver.evaluations
     loops.use(solver)
     loops.use(mine)
     for steps in STEPS[: MOST_LOOPS - 1]:
         loops.use(EulerLoop(steps, 10))
-    assert gone == [solver, *others]
+    assert lost == [solver, *others]
 
 
 def test_a_failed_capture_leaves_nothing_of_its_loop_and_the_next_one_succeeds() -> None:
-    gone: list[Loop] = []
-    graphs, key = GraphCache(gone.append), GraphKey("answer", 1, 2, False, 16, EulerLoop(2, 7))
+    lost: list[Loop] = []
+    graphs, key = GraphCache(lost.append), GraphKey("answer", 1, 2, False, 16, EulerLoop(2, 7))
 
     def fail(key: GraphKey) -> Captured:
         raise torch.OutOfMemoryError("CUDA out of memory")
@@ -171,11 +171,11 @@ def test_a_failed_capture_leaves_nothing_of_its_loop_and_the_next_one_succeeds()
         with pytest.raises(torch.OutOfMemoryError):
             graphs.capture(key, fail)
         assert graphs.entries == {} and graphs.get(key) is None and list(graphs.loops) == []
-    assert gone == [key.loop] * 2, "tables and kernels that were made for it are let go"
+    assert lost == [key.loop] * 2, "tables and kernels that were made for it are let go"
     graphs.capture(key, lambda key: Captured(cast(Any, None), "buffers"))
     with pytest.raises(torch.OutOfMemoryError):
         graphs.capture(key._replace(slots=32), fail)
-    assert list(graphs.entries) == [key] and list(graphs.loops) == [key.loop] and len(gone) == 2, "another has it"
+    assert list(graphs.entries) == [key] and list(graphs.loops) == [key.loop] and len(lost) == 2, "another has it"
 
 
 class OutOfMemory(Unrun):

@@ -40,9 +40,9 @@ def test_the_clones_command_is_one_that_pip_understands() -> None:
     """Asked of pip itself, which reads the clone's extras and installs nothing."""
     command = install_command("onnx").replace("'", "").split(" install ")[1].split()
     dry = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-deps", "--no-index", "--no-build-isolation"]
-    told = subprocess.run([*dry, *command], capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
-    assert "does not provide the extra" not in told.stderr
+    reported = subprocess.run([*dry, *command], capture_output=True, text=True, check=False)
+    assert reported.returncode == 0, reported.stderr
+    assert "does not provide the extra" not in reported.stderr
 
 
 @pytest.mark.parametrize(

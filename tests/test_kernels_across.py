@@ -15,7 +15,7 @@ from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS
 from turbopi.kernels.sm90.vjp import products
-from turbopi.kernels.sm90.vjp.products import ACROSS, TAKES, Cut, Mode, cut, way_back
+from turbopi.kernels.sm90.vjp.products import ACROSS, TAKES, Cut, Mode, backward_form, cut
 
 FULL = GemmaConfig(1024, 4096)
 
@@ -80,8 +80,8 @@ def test_the_full_models_products_fill_a_hopper_gpu_once() -> None:
 
 
 def test_other_sizes_and_more_tokens_keep_other_kernels() -> None:
-    assert way_back(FULL, 10) is ACROSS and way_back(FULL, 17) is FEW_TOKENS is way_back(FULL, 64)
-    assert way_back(FULL, 65) is BETWEEN_PRODUCTS and way_back(FULL, 10, masked=True) is BETWEEN_PRODUCTS
+    assert backward_form(FULL, 10) is ACROSS and backward_form(FULL, 17) is FEW_TOKENS is backward_form(FULL, 64)
+    assert backward_form(FULL, 65) is BETWEEN_PRODUCTS and backward_form(FULL, 10, masked=True) is BETWEEN_PRODUCTS
     for mode in ("plain", "geglu", "parts"):
         assert cut(mode, 10, 96, 64) is None and cut(mode, 10, 512, 24) is None and cut(mode, 17, 1024, 64) is None
 

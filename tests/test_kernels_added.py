@@ -157,9 +157,9 @@ def test_a_batchs_prefix_of_full_size_is_as_without(precision: Precision) -> Non
     found: list[Tensor] = []
     for add_linear in (None, recording, recording):
         ops = dataclasses.replace(usual, add_linear=add_linear)
-        pictures = Images(config, weights, ops, 8, False, 0)
-        pictures.embs.copy_(torch.randn(pictures.embs.shape, generator=torch.Generator().manual_seed(0)))
-        buffers = BatchBuffers(config, weights, ops, BatchSize(4, 8), pictures, 4 * 48)
+        camera_images = Images(config, weights, ops, 8, False, 0)
+        camera_images.embs.copy_(torch.randn(camera_images.embs.shape, generator=torch.Generator().manual_seed(0)))
+        buffers = BatchBuffers(config, weights, ops, BatchSize(4, 8), camera_images, 4 * 48)
         prefix = PackedPrefix(buffers, 4 * 48)
         prefix.write([2] * 4, [np.arange(1, count) for count in (40, 47, 20, 30)])
         with torch.inference_mode():

@@ -167,10 +167,10 @@ def test_nan_in_a_token_shows_in_its_row_alone(machine: Machine, tile: SuffixTil
 
 
 def test_where_no_cluster_fits_it_is_asked_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+    requested = []
 
     def no_room(*given: object, cluster: int, **rest: object) -> None:
-        asked.append(cluster)
+        requested.append(cluster)
         raise BackendUnavailable("no room for one")
 
     monkeypatch.setattr(suffix, "compile_cubin", lambda *given: b"")
@@ -181,7 +181,9 @@ def test_where_no_cluster_fits_it_is_asked_once(monkeypatch: pytest.MonkeyPatch)
         with pytest.raises(BackendUnavailable, match="no room for one"):
             suffix._kernel(tile, False, torch.device("meta"))
     suffix._kernel_or_why_not.cache_clear()
-    assert asked == [8, 6, 8, 4, 2, 1], "of two warpgroups, of suffix.cu; never of four, which have as many clusters"
+    assert requested == [8, 6, 8, 4, 2, 1], (
+        "of two warpgroups, of suffix.cu; never of four, which have as many clusters"
+    )
 
 
 def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:

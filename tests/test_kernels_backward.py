@@ -9,7 +9,7 @@ from conftest import gpu_or_interpreter
 from test_kernels_ops import DEVICE, DTYPE, assert_as_good, poison_allocator, random
 from torch import Tensor
 
-from turbopi.kernels import backward as twins
+from turbopi.kernels import backward as references
 from turbopi.kernels import plain
 from turbopi.kernels.portable import backward
 from turbopi.models.pi0.layers import rope_tables
@@ -28,14 +28,14 @@ def close(ours: Tensor, exact: Tensor) -> None:
     torch.testing.assert_close(ours.double(), exact, atol=1e-5 * max(1.0, float(exact.abs().max())), rtol=1e-5)
 
 
-def as_its_twin(name: str, *arguments: object) -> None:
+def as_its_reference(name: str, *arguments: object) -> None:
     """The Triton kernel against its twin on the same numbers, both against the twin in float32."""
     wide = [one.float() if isinstance(one, Tensor) and one.is_floating_point() else one for one in arguments]
-    twin, exact = getattr(twins, name)(*arguments), getattr(twins, name)(*wide)
+    reference, exact = getattr(references, name)(*arguments), getattr(references, name)(*wide)
     poison_allocator()
     ours = getattr(backward, name)(*arguments)
     for found, expected, right in zip(
-        *((x if isinstance(x, tuple) else (x,)) for x in (ours, twin, exact)), strict=True
+        *((x if isinstance(x, tuple) else (x,)) for x in (ours, reference, exact)), strict=True
     ):
         if expected is None:
             assert found is None
@@ -52,17 +52,17 @@ def test_a_norm(tokens: int, width: int, by_row: bool, more: bool) -> None:
     scale, gate = random(*shape, dtype=torch.float32), random(*shape, dtype=torch.float32)
     d_x = random(tokens, width, dtype=torch.float32)
     given = (d_x, gate) if more else (None, None)
-    as_its_twin("rms_norm_vjp", d_normed, x, scale, 1e-6, *given)
+    as_its_reference("rms_norm_vjp", d_normed, x, scale, 1e-6, *given)
     norm = lambda x: x * (x.square().mean(-1, keepdim=True) + 1e-6).rsqrt() * scale.double()  # noqa: E731
     (expected,) = autograd(norm, d_normed, x)
-    through, gated = twins.rms_norm_vjp(d_normed.float(), x.float(), scale, 1e-6, *given)
+    through, gated = references.rms_norm_vjp(d_normed.float(), x.float(), scale, 1e-6, *given)
     expected = expected + d_x if more else expected
     close(through, expected)
     if gated is not None:
         close(gated, expected * gate)
 
 
-@pytest.mark.parametrize("back", [twins, backward], ids=["twin", "triton"])
+@pytest.mark.parametrize("back", [references, backward], ids=["reference", "triton"])
 @pytest.mark.parametrize("by_row", [False, True])
 def test_a_gate_is_rounded_on_the_way_back_as_on_the_way_there(by_row: bool, back: ModuleType) -> None:
     """In bfloat16 1.003 is 1: it changes no bit."""
@@ -76,18 +76,18 @@ def test_a_gate_is_rounded_on_the_way_back_as_on_the_way_there(by_row: bool, bac
 def test_geglu(tokens: int, hidden: int) -> None:
     d_hidden, gate_up = random(tokens, hidden), random(tokens, 2 * hidden)
     gate_up[0, 0], gate_up[0, 1] = 30, -30  # where tanh is flat
-    as_its_twin("geglu_vjp", d_hidden, gate_up)
+    as_its_reference("geglu_vjp", d_hidden, gate_up)
     (expected,) = autograd(plain.geglu, d_hidden, gate_up)
-    close(twins.geglu_vjp(d_hidden.float(), gate_up.float()), expected)
+    close(references.geglu_vjp(d_hidden.float(), gate_up.float()), expected)
 
 
 @pytest.mark.parametrize(("rows", "keys"), [(8, 5), (80, 608), (24, 33)])
 def test_softmax(rows: int, keys: int) -> None:
     logits, d = random(rows, keys, dtype=torch.float32), random(rows, keys, dtype=torch.float32)
     p = (logits * 0.25).softmax(-1).to(DTYPE)
-    as_its_twin("softmax_vjp", p, d, 0.25)
+    as_its_reference("softmax_vjp", p, d, 0.25)
     (expected,) = autograd(lambda x: (x * 0.25).softmax(-1), d, logits)
-    close(twins.softmax_vjp((logits * 0.25).softmax(-1), d, 0.25), expected)
+    close(references.softmax_vjp((logits * 0.25).softmax(-1), d, 0.25), expected)
 
 
 @pytest.mark.parametrize(("tokens", "heads", "head_dim"), [(1, 1, 8), (10, 8, 256), (7, 4, 16)])
@@ -95,7 +95,7 @@ def test_rope(tokens: int, heads: int, head_dim: int) -> None:
     d_q, d_k, d_v = random(tokens * heads, head_dim), random(tokens, head_dim), random(tokens, head_dim)
     cos, sin = (one[0, 0].contiguous() for one in rope_tables(torch.arange(3, 3 + tokens)[None], head_dim, 1e4))
     cos, sin = cos.to(DEVICE), sin.to(DEVICE)
-    as_its_twin("rope_vjp", d_q, d_k, d_v, cos, sin)
+    as_its_reference("rope_vjp", d_q, d_k, d_v, cos, sin)
 
     def split(qkv: Tensor) -> Tensor:
         x, half = qkv.view(tokens, heads + 2, head_dim), head_dim // 2
@@ -107,4 +107,4 @@ def test_rope(tokens: int, heads: int, head_dim: int) -> None:
     # queries of all tokens, head by head, with the key behind them: so order the gradients
     d_out = torch.cat((torch.cat((d_q.view(tokens, heads, -1), d_k[:, None]), 1).view(-1, head_dim), d_v))
     (expected,) = autograd(split, d_out, random(tokens, (heads + 2) * head_dim))
-    close(twins.rope_vjp(d_q.float(), d_k.float(), d_v.float(), cos, sin), expected)
+    close(references.rope_vjp(d_q.float(), d_k.float(), d_v.float(), cos, sin), expected)

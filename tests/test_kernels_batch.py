@@ -64,10 +64,10 @@ def test_packed_attention_leaves_in_int8(lengths: list[int], spare: int, batch: 
     q, k, v = random((rows + spare) * HEADS, DIM), random(rows + spare, DIM, seed=1), random(rows + spare, DIM, seed=2)
     to: dict[str, Any] = {"inverse": 40.0, "numbers": torch.int8}
     ours = portable_batch.packed_attention(q, k, v, segments, HEADS, **to)[:rows]
-    twin = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
+    reference = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
     assert ours.dtype == torch.int8 and int(ours.abs().max()) > 30
-    rounding, before = 0.5, 40 * TOLERANCE * (1 + twin.abs())  # as `check_packed` allows before it is rounded
-    assert bool(((ours.float() - 40 * twin).abs() <= rounding + before).all())
+    rounding, before = 0.5, 40 * TOLERANCE * (1 + reference.abs())  # as `check_packed` allows before it is rounded
+    assert bool(((ours.float() - 40 * reference).abs() <= rounding + before).all())
 
 
 def test_damage_in_int8_shows_in_the_values_of_its_own_observation() -> None:
@@ -91,18 +91,18 @@ def test_packed_attention_on_hopper_of_heads_of_256(inverse: float | None) -> No
     dim, rows = 256, 473
     segments, _ = packed([300, 3, 170], 7, 4)
     q, k, v = random(480 * HEADS, dim), random(480, dim, seed=1), random(480, dim, seed=2)
-    twin = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
+    reference = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
     k[rows:], v[rows:] = torch.nan, torch.nan
     ours = attention.packed_attention(q, k, v, segments, HEADS, inverse).float()
     assert bool(ours[rows:].isnan().all())
     if inverse is None:
-        torch.testing.assert_close(ours[:rows], twin, atol=TOLERANCE, rtol=TOLERANCE)
+        torch.testing.assert_close(ours[:rows], reference, atol=TOLERANCE, rtol=TOLERANCE)
     else:
-        assert_rounded_to_e4m3(ours[:rows] / inverse, twin)
+        assert_rounded_to_e4m3(ours[:rows] / inverse, reference)
 
 
-def assert_rounded_to_e4m3(ours: Tensor, twin: Tensor) -> None:
-    assert float((ours - twin).norm() / twin.norm()) < 0.035
+def assert_rounded_to_e4m3(ours: Tensor, reference: Tensor) -> None:
+    assert float((ours - reference).norm() / reference.norm()) < 0.035
 
 
 def check_packed(attend: Callable[..., Tensor], lengths: list[int], spare: int, batch: int) -> None:
@@ -233,11 +233,11 @@ def test_keys_are_split_as_there_are_blocks_to_fill() -> None:
 
 
 def test_embedding_rows() -> None:
-    pictures, table, source = random(6, 20), random(9, 20, seed=1), torch.tensor([2, -1, -9, 5, 0], device=DEVICE)
-    ours, twin = torch.empty(5, 20, device=DEVICE, dtype=DTYPE), torch.empty(5, 20, device=DEVICE, dtype=DTYPE)
-    portable_batch.embed_rows(source, pictures, table, ours)
-    plain_batch.embed_rows(source, pictures, table, twin)
-    assert torch.equal(ours, twin) and torch.equal(ours[[0, 3, 4]], pictures[[2, 5, 0]])
+    camera_images, table, source = random(6, 20), random(9, 20, seed=1), torch.tensor([2, -1, -9, 5, 0], device=DEVICE)
+    ours, reference = torch.empty(5, 20, device=DEVICE, dtype=DTYPE), torch.empty(5, 20, device=DEVICE, dtype=DTYPE)
+    portable_batch.embed_rows(source, camera_images, table, ours)
+    plain_batch.embed_rows(source, camera_images, table, reference)
+    assert torch.equal(ours, reference) and torch.equal(ours[[0, 3, 4]], camera_images[[2, 5, 0]])
 
 
 @pytest.mark.slow
@@ -260,8 +260,8 @@ def test_the_experts_norm_of_rows_with_their_own_modulation() -> None:
     x, y = random(5, 64), random(5, 64, seed=1)
     gate, scale, shift = (random(5, 64, seed=seed).float() for seed in (2, 3, 4))
     ours = batch_steps.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
-    twin = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
-    torch.testing.assert_close(ours, twin, atol=TOLERANCE, rtol=TOLERANCE)
+    reference = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
+    torch.testing.assert_close(ours, reference, atol=TOLERANCE, rtol=TOLERANCE)
 
 
 @pytest.mark.parametrize("parts", [0, 2])
@@ -274,11 +274,11 @@ def test_a_steps_end(rows: int, width: int, actions: int, gated: bool, parts: in
     into = random(width, actions, seed=7).float() / actions**0.5, random(width, seed=8).float()
     end = StepEnd(scale, shift, 1e-6, out, -0.1, into)
     x_t = random(rows, actions, seed=9).float()
-    ours, twin = ([torch.full((rows, actions), torch.nan, device=DEVICE) for _ in range(2)] for _ in range(2))
+    ours, reference = ([torch.full((rows, actions), torch.nan, device=DEVICE) for _ in range(2)] for _ in range(2))
     given = gate if gated else None, end, x_t
     tokens = batch_steps.end_step(x.clone(), y, *given, *ours)
     whole = y.float().sum(0).to(DTYPE) if parts else y
-    expected = plain_batch.end_step(x, whole, *given, *twin)
-    torch.testing.assert_close(ours, twin, atol=TOLERANCE, rtol=TOLERANCE)
+    expected = plain_batch.end_step(x, whole, *given, *reference)
+    torch.testing.assert_close(ours, reference, atol=TOLERANCE, rtol=TOLERANCE)
     torch.testing.assert_close(tokens, expected, atol=TOLERANCE, rtol=TOLERANCE)
     assert tokens.dtype == x.dtype and torch.equal(ours[0], ours[0]) and bool((ours[0] != x_t).any())

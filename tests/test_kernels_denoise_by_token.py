@@ -246,8 +246,8 @@ def test_a_lane_gets_its_tokens_factors_of_its_columns(on_cpu: OnCpu) -> None:
         for token in range(0, suffix, 2):
             both = on_cpu.tokens.rows[step, [token, min(token + 1, suffix - 1)]].tolist()
             expected = [on_cpu.table[row, norm, kind, 6 + i] for i in (0, 1) for row in both]
-            for asked in (0, 1):
-                assert on_cpu.call("look_up", step, step * depth + layer, part, 6, token, asked) == expected
+            for requested in (0, 1):
+                assert on_cpu.call("look_up", step, step * depth + layer, part, 6, token, requested) == expected
 
 
 def test_a_lane_gets_its_tokens_shifts_of_its_rows(on_cpu: OnCpu) -> None:

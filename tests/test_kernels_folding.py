@@ -241,7 +241,7 @@ def test_a_norm_of_a_copy_errs_no_more_than_one_before_the_product(
     out_tile: Tile, rows: int, growth: float, kind: str
 ) -> None:
     residual, scale, shift = stream(kind, rows), random(WIDTH), random(WIDTH)
-    if kind == "constant rows":  # of some pictures the first layers' streams; nothing that was there before counts
+    if kind == "constant rows":  # of some images the first layers' streams; nothing that was there before counts
         residual[::3] = residual[::3, :1]
         growth = 1.0
     if kind == "cancelled outliers":  # the shift takes away what is always there

@@ -137,8 +137,8 @@ def test_a_dependent_launch_has_the_kernels_grid_block_cluster_and_shared_memory
     dims = cluster.value.clusterDim
     assert (dims.x, dims.y, dims.z) == (2, 1, 1)
     assert parameters != 0
-    (asked,) = [args for name, args in installed.calls if name == "cuOccupancyMaxActiveClusters"]
-    assert (asked[1].gridDimX, asked[1].blockDimX, asked[1].sharedMemBytes) == (2, 128, 5000)
+    (requested,) = [args for name, args in installed.calls if name == "cuOccupancyMaxActiveClusters"]
+    assert (requested[1].gridDimX, requested[1].blockDimX, requested[1].sharedMemBytes) == (2, 128, 5000)
     (allowed,) = [args for name, args in installed.calls if name == "cuFuncSetAttribute"]
     assert allowed[0] == 2 and allowed[2] == 5000, "more than 48 KB must be allowed before a launch"
 

@@ -37,21 +37,21 @@ def random(*shape: int, outliers: bool = False, dtype: torch.dtype = DTYPE) -> T
     return x.to(DEVICE, dtype)
 
 
-def assert_as_good(ours: Tensor, twin: Tensor, exact: Tensor) -> None:
+def assert_as_good(ours: Tensor, reference: Tensor, exact: Tensor) -> None:
     """`ours` is finite and no worse than twice `twin`'s error against `exact` (float32)."""
-    assert ours.shape == twin.shape and ours.dtype == twin.dtype and bool(ours.isfinite().all())
+    assert ours.shape == reference.shape and ours.dtype == reference.dtype and bool(ours.isfinite().all())
     if ours.dtype == torch.float32:
         torch.testing.assert_close(ours, exact, atol=1e-5 * max(1.0, exact.abs().max().item()), rtol=1e-5)
         return
-    assert_error_at_most_double(ours, twin, exact)
+    assert_error_at_most_double(ours, reference, exact)
 
 
-def assert_error_at_most_double(ours: Tensor, twin: Tensor, exact: Tensor) -> None:
+def assert_error_at_most_double(ours: Tensor, reference: Tensor, exact: Tensor) -> None:
     def rms(x: Tensor) -> float:
         return float((x.double() - exact.double()).square().mean().sqrt())
 
-    assert rms(ours) <= 2 * rms(twin) + 1e-7 * float(exact.double().square().mean().sqrt())
-    largest = (twin.double() - exact.double()).abs().max()
+    assert rms(ours) <= 2 * rms(reference) + 1e-7 * float(exact.double().square().mean().sqrt())
+    largest = (reference.double() - exact.double()).abs().max()
     assert (ours.double() - exact.double()).abs().max() <= 2 * largest + 1e-7 * exact.abs().max()
 
 
@@ -87,10 +87,10 @@ def test_residual_rms_norm(width: int, rows: int, form: str) -> None:
         y = exact_y.to(DTYPE)
     poison_allocator()
     ours = norms.residual_rms_norm(x, given, gate, scale, shift, 1e-6)
-    twin = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
+    reference = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
     exact_gate = None if gate is None else gate.to(DTYPE).float()
     exact = plain.residual_rms_norm(x.float(), exact_y, exact_gate, scale, shift, 1e-6)
-    for a, b, c in zip(ours, twin, exact, strict=True):
+    for a, b, c in zip(ours, reference, exact, strict=True):
         assert_as_good(a, b, c)
 
 
@@ -104,9 +104,9 @@ def test_residual_layer_norm(width: int, rows: int, residual: bool) -> None:
     weight, bias = random(width), random(width)
     poison_allocator()
     ours = norms.residual_layer_norm(x, y, weight, bias, 1e-6)
-    twin = plain.residual_layer_norm(x, y, weight, bias, 1e-6)
+    reference = plain.residual_layer_norm(x, y, weight, bias, 1e-6)
     exact = plain.residual_layer_norm(x.float(), None if y is None else y.float(), weight.float(), bias.float(), 1e-6)
-    for a, b, c in zip(ours, twin, exact, strict=True):
+    for a, b, c in zip(ours, reference, exact, strict=True):
         assert_as_good(a, b, c)
 
 
@@ -131,16 +131,16 @@ def test_rope_split(head_dim: int, heads: int, tokens: int) -> None:
         return whole[0, 1:-1], whole[1, 1:-1]
 
     ours_k, ours_v = cache(DTYPE)
-    twin_k, twin_v = cache(DTYPE)
+    reference_k, reference_v = cache(DTYPE)
     exact_k, exact_v = cache(torch.float32)
     poison_allocator()
     ours_q = rope.rope_split(qkv, cos, sin, ours_k, ours_v)
-    twin_q = plain.rope_split(qkv, cos, sin, twin_k, twin_v)
+    reference_q = plain.rope_split(qkv, cos, sin, reference_k, reference_v)
     exact_q = plain.rope_split(qkv.float(), cos, sin, exact_k, exact_v)
     if heads:
-        assert_as_good(ours_q, twin_q, exact_q)
-    assert_as_good(ours_k, twin_k, exact_k)
-    assert torch.equal(ours_v, twin_v)
+        assert_as_good(ours_q, reference_q, exact_q)
+    assert_as_good(ours_k, reference_k, exact_k)
+    assert torch.equal(ours_v, reference_v)
     base = ours_k._base
     assert base is not None and bool(base[:, [0, -1]].isnan().all()), "wrote outside its rows"
 
@@ -165,11 +165,11 @@ def prefix_problem(
     q[:, ::5] *= 8
     k[:, ::7] *= 8
     on_device = torch.tensor([length], device=DEVICE)
-    twin = plain.attention(q, k, v, on_device, slots, heads)
+    reference = plain.attention(q, k, v, on_device, slots, heads)
     exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads)
     k[length:], v[length:] = torch.nan, torch.nan
     poison_allocator()
-    return (q, k, v, on_device), twin, exact
+    return (q, k, v, on_device), reference, exact
 
 
 @pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
@@ -177,8 +177,8 @@ def prefix_problem(
 def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: int, slots: int, length: int) -> None:
     if not ON_GPU and slots > 16:
         slots, length, heads = slots // 8, length // 8, 2
-    inputs, twin, exact = prefix_problem(heads, head_dim, slots, length)
-    assert_as_good(attention.prefix_attention(*inputs, heads), twin, exact)
+    inputs, reference, exact = prefix_problem(heads, head_dim, slots, length)
+    assert_as_good(attention.prefix_attention(*inputs, heads), reference, exact)
 
 
 @on_hopper
@@ -221,10 +221,10 @@ def test_wide_vision_attention_on_hopper(
     ("slots", "length"), [(16, 1), (272, 261), (304, 64), (560, 560), (560, 547), (816, 803), (976, 960)]
 )
 def test_prefix_attention_on_hopper(heads: int, head_dim: int, slots: int, length: int, warpgroups: int) -> None:
-    inputs, twin, exact = prefix_problem(heads, head_dim, slots, length)
+    inputs, reference, exact = prefix_problem(heads, head_dim, slots, length)
     tile = attention_hopper.AttentionTile(head_dim, 64, warpgroups) if warpgroups else None
     first = attention_hopper.prefix_attention(*inputs, heads, tile=tile)
-    assert_as_good(first, twin, exact)
+    assert_as_good(first, reference, exact)
     for _ in range(5):
         assert torch.equal(attention_hopper.prefix_attention(*inputs, heads, tile=tile), first)
 
@@ -253,10 +253,10 @@ def test_masked_softmax(suffix: int, slots: int, length: int, state_token: bool)
     on_device = torch.tensor([length], device=DEVICE)
     args = (on_device, slots, heads, state_token, 0.25)
     exact = plain.masked_softmax(logits, *args, torch.float32)
-    twin = plain.masked_softmax(logits, *args, DTYPE)
+    reference = plain.masked_softmax(logits, *args, DTYPE)
     logits[:, length:slots] = torch.nan
     poison_allocator()
-    assert_as_good(attention.masked_softmax(logits, *args, DTYPE), twin, exact)
+    assert_as_good(attention.masked_softmax(logits, *args, DTYPE), reference, exact)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -264,10 +264,10 @@ def test_masked_softmax(suffix: int, slots: int, length: int, state_token: bool)
 def test_patch_rows_are_exact(images: int, dtype: torch.dtype) -> None:
     size = 224 if ON_GPU else 28
     g = torch.Generator().manual_seed(images)
-    pictures = torch.randint(0, 256, (images, size, size, 3), generator=g).to(DEVICE, dtype)
+    camera_images = torch.randint(0, 256, (images, size, size, 3), generator=g).to(DEVICE, dtype)
     poison_allocator()
-    ours, twin = embedding.patch_rows(pictures, 14), plain.patch_rows(pictures, 14)
-    torch.testing.assert_close(ours, twin, atol=1.2e-7, rtol=0)
+    ours, reference = embedding.patch_rows(camera_images, 14), plain.patch_rows(camera_images, 14)
+    torch.testing.assert_close(ours, reference, atol=1.2e-7, rtol=0)
 
 
 @pytest.mark.skipif(not ON_GPU, reason="a product of the library's with float32 results needs a GPU")
@@ -275,20 +275,20 @@ def test_patch_rows_are_exact(images: int, dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_embed_patches_loses_nothing_of_float32(images: int, dtype: torch.dtype) -> None:
     g = torch.Generator().manual_seed(images)
-    pictures = torch.randint(0, 256, (images, 224, 224, 3), generator=g).to(DEVICE, torch.uint8)
-    given = pictures if dtype == torch.uint8 else pictures.float() / 255 * 2 - 1
+    camera_images = torch.randint(0, 256, (images, 224, 224, 3), generator=g).to(DEVICE, torch.uint8)
+    given = camera_images if dtype == torch.uint8 else camera_images.float() / 255 * 2 - 1
     weight, position = random(1152, 588, dtype=torch.float32), random(256, 1152, dtype=torch.float32)
     ours = EmbedPatches()(given, weight, position, torch.float32)
-    normalised = pictures.double() / 255 * 2 - 1
+    normalised = camera_images.double() / 255 * 2 - 1
     exact = plain.embed_patches(normalised, weight.double(), position.double(), torch.float64)
     assert (ours - exact).square().mean().sqrt() < 1e-5 * exact.square().mean().sqrt()
 
 
 def test_odd_rows_are_255_times_the_patches() -> None:
-    pictures = torch.randint(0, 256, (2, 28, 28, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(3))
-    pictures = pictures.to(DEVICE)
-    ours = embedding.odd_rows(pictures, 14, DTYPE).float()
-    twice = plain.patch_rows(pictures, 14).repeat(1, 2) * 255
+    camera_images = torch.randint(0, 256, (2, 28, 28, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(3))
+    camera_images = camera_images.to(DEVICE)
+    ours = embedding.odd_rows(camera_images, 14, DTYPE).float()
+    twice = plain.patch_rows(camera_images, 14).repeat(1, 2) * 255
     torch.testing.assert_close(ours, twice.round(), atol=0, rtol=0)
 
 
@@ -301,10 +301,10 @@ def test_add_position() -> None:
 @pytest.mark.parametrize("width", [96, 2048])
 def test_embed_prompt_is_exact(width: int) -> None:
     table, tokens = random(300, width), torch.tensor([0, 299, 5, 5, 17], device=DEVICE)
-    ours, twin = (torch.full((5, width), torch.nan, dtype=DTYPE, device=DEVICE) for _ in range(2))
+    ours, reference = (torch.full((5, width), torch.nan, dtype=DTYPE, device=DEVICE) for _ in range(2))
     embedding.embed_prompt(tokens, table, ours)
-    plain.embed_prompt(tokens, table, twin)
-    assert torch.equal(ours, twin)
+    plain.embed_prompt(tokens, table, reference)
+    assert torch.equal(ours, reference)
 
 
 TILES = [
@@ -326,10 +326,10 @@ def test_matmul(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile) -> None:
     def after(y: Tensor) -> Tensor:
         return plain.gelu(y) if epilogue == "gelu" else plain.geglu(y) if epilogue == "geglu" else y
 
-    twin = after(plain.linear(x, weight, bias))
+    reference = after(plain.linear(x, weight, bias))
     exact = after(plain.linear(x.float(), weight.float(), None if bias is None else bias.float()))
     out = torch.full((m, n), torch.nan, device=DEVICE, dtype=DTYPE)
-    assert_as_good(matmul(x, weight, tile, epilogue, bias, out), twin, exact)
+    assert_as_good(matmul(x, weight, tile, epilogue, bias, out), reference, exact)
 
 
 @on_hopper
@@ -339,10 +339,10 @@ def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
     poison_allocator()
     ours = products.tuned_residual_linear(x, weight, bias)
-    twin, exact = plain.linear(x, weight, bias), plain.linear(x.float(), weight.float(), bias.float())
-    assert_as_good((ours.sum(0) if ours.dim() == 3 else ours).to(DTYPE), twin, exact)
+    reference, exact = plain.linear(x, weight, bias), plain.linear(x.float(), weight.float(), bias.float())
+    assert_as_good((ours.sum(0) if ours.dim() == 3 else ours).to(DTYPE), reference, exact)
     if tiles.VISION_TILES[shape].splits == 1:
-        assert_as_good(products.tuned_linear_gelu(x, weight, bias), plain.gelu(twin), plain.gelu(exact))
+        assert_as_good(products.tuned_linear_gelu(x, weight, bias), plain.gelu(reference), plain.gelu(exact))
 
 
 @on_hopper
@@ -350,8 +350,10 @@ def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None
 def test_tuned_geglu(rows: int) -> None:
     x, weight = random(rows, 2048, outliers=True), random(2 * 16384, 2048) / 45
     poison_allocator()
-    twin = plain.geglu(plain.linear(x, weight))
-    assert_as_good(products.tuned_linear_geglu(x, weight), twin, plain.geglu(plain.linear(x.float(), weight.float())))
+    reference = plain.geglu(plain.linear(x, weight))
+    assert_as_good(
+        products.tuned_linear_geglu(x, weight), reference, plain.geglu(plain.linear(x.float(), weight.float()))
+    )
 
 
 @on_hopper
@@ -383,8 +385,8 @@ def test_the_product_behind_geglu(rows: int) -> None:
     x, weight = random(rows, 16384, outliers=True), random(2048, 16384) / 128
     poison_allocator()
     ours = products.tuned_residual_linear(x, weight)
-    twin, exact = plain.linear(x, weight), plain.linear(x.float(), weight.float())
-    assert_error_at_most_double(ours.float().sum(0) if ours.dim() == 3 else ours, twin, exact)
+    reference, exact = plain.linear(x, weight), plain.linear(x.float(), weight.float())
+    assert_error_at_most_double(ours.float().sum(0) if ours.dim() == 3 else ours, reference, exact)
     assert (ours.dim() == 3) == ((-(-rows // 64) * 64, 2048, 16384) in tiles.PARTS_TILES)
 
 
@@ -409,7 +411,7 @@ def test_matmul_waits_for_the_kernel_before_it() -> None:
         product = matmul(y, weight, Tile(2, 128), "plain")
         return norms.residual_rms_norm(product, None, None, scale, None, 1e-6)[1]
 
-    def twin(y: Tensor, weight: Tensor) -> Tensor:
+    def reference(y: Tensor, weight: Tensor) -> Tensor:
         return plain.residual_rms_norm(plain.linear(y, weight), None, None, scale, None, 1e-6)[1]
 
     def chain(step: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -426,7 +428,7 @@ def test_matmul_waits_for_the_kernel_before_it() -> None:
         captured.fill_(torch.nan)
         graph.replay()
         assert torch.equal(captured, first)
-    assert (first.float() - chain(twin).float()).abs().mean() < 0.05
+    assert (first.float() - chain(reference).float()).abs().mean() < 0.05
 
 
 @pytest.mark.skipif(not ON_GPU, reason="cuBLAS's epilogue needs a GPU")
@@ -447,10 +449,10 @@ def test_a_transfer_brings_all_and_nothing_else(shape: tuple[int, ...], dtype: t
     host = host.pin_memory() if ON_GPU else host
     on_device = torch.zeros(2, *shape, dtype=dtype, device=DEVICE)
     back = torch.zeros(shape, dtype=dtype, pin_memory=ON_GPU)
-    twin = torch.zeros_like(on_device)
+    reference = torch.zeros_like(on_device)
     transfer.transfer(host, on_device[0])
-    plain.transfer(host, twin[0])
+    plain.transfer(host, reference[0])
     transfer.transfer(on_device[0], back)
     if ON_GPU:
         torch.cuda.synchronize()
-    assert torch.equal(on_device, twin) and torch.equal(back, host)
+    assert torch.equal(on_device, reference) and torch.equal(back, host)

@@ -6,6 +6,7 @@ product is held against the float32 sums of its numbers. INT8 needs no such GPU.
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -175,20 +176,20 @@ def test_operations_take_both_kinds_of_matrix(monkeypatch: pytest.MonkeyPatch, f
     x, matrix = operands(5, 48, 32, format)
     half = matrix[:24]
     tolerance = 0.006 if ON_GPU else 1e-6
-    for ours, twin in (
+    for ours, reference in (
         (ops.linear(x, half, bias), plain.linear(x, half, bias)),
         (ops.linear(x, half, None, random(5, 24)), plain.linear(x, half)),
         (ops.residual_linear(x, half, bias), plain.linear(x, half, bias)),
         (ops.linear_gelu(x, half, bias), plain.linear_gelu(x, half, bias)),
         (ops.linear_geglu(x, matrix), plain.linear_geglu(x, matrix)),
     ):
-        assert ours.shape == twin.shape and relative(ours, twin) < tolerance
+        assert ours.shape == reference.shape and relative(ours, reference) < tolerance
     wide, gate_up = random(5, 32), random(48, 32)
     assert relative(ops.linear_geglu(wide, gate_up), plain.linear_geglu(wide, gate_up)) < tolerance
-    twin = plain.linear_geglu(wide, gate_up)
-    inverse = 0.9 * format.largest / float(twin.abs().max())
+    reference = plain.linear_geglu(wide, gate_up)
+    inverse = 0.9 * format.largest / float(reference.abs().max())
     rounded = ops.linear_geglu(wide, gate_up, inverse=inverse, numbers=format.dtype)
-    assert rounded.dtype == stored(format) and relative(rounded.float() / inverse, twin) < 0.04
+    assert rounded.dtype == stored(format) and relative(rounded.float() / inverse, reference) < 0.04
 
 
 def test_parts_are_what_the_norms_add_up() -> None:
@@ -196,8 +197,8 @@ def test_parts_are_what_the_norms_add_up() -> None:
     stream, scale = random(9, 32), torch.ones(32, device=DEVICE)
     parts = product(x, matrix, "parts", tile=Tile(32, 64, 4, 6, splits=3))
     ours = norms.residual_rms_norm(stream, parts, None, scale, None, 1e-6)
-    twin = plain.residual_rms_norm(stream, plain.linear(x, matrix), None, scale, None, 1e-6)
-    assert all(relative(a, b) < (0.01 if ON_GPU else 1e-6) for a, b in zip(ours, twin, strict=True))
+    reference = plain.residual_rms_norm(stream, plain.linear(x, matrix), None, scale, None, 1e-6)
+    assert all(relative(a, b) < (0.01 if ON_GPU else 1e-6) for a, b in zip(ours, reference, strict=True))
 
 
 @pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
@@ -207,19 +208,22 @@ def test_whatever_stands_before_a_product_leaves_in_its_numbers(format: Format) 
     keys, length = random(8, 16), torch.tensor([7], device=DEVICE)
     to: dict[str, Any] = {"inverse": format.largest / 9, "numbers": format.dtype}
     norm, layer_norm = (x, None, None, ones.float(), None, 1e-6), (x, x, ones, ones, 1e-6)
-    pictures, prefix = (qkv, 2, 2), (qkv.view(-1, 16), keys, keys, length, 8, 6)
-    for ours, twin in (
+    camera_images, prefix = (qkv, 2, 2), (qkv.view(-1, 16), keys, keys, length, 8, 6)
+    for ours, reference in (
         (activations.geglu(x, **to), plain.as_input(plain.geglu(x.float()), DTYPE, **to)),
         (norms.residual_rms_norm(*norm, **to)[1], plain.residual_rms_norm(*norm, **to)[1]),
         (norms.residual_layer_norm(*layer_norm, **to)[1], plain.residual_layer_norm(*layer_norm, **to)[1]),
-        (attention.vision_attention(*pictures, **to), plain.vision_attention(*pictures, **to)),
+        (attention.vision_attention(*camera_images, **to), plain.vision_attention(*camera_images, **to)),
         (attend(*prefix, **to), plain.attention(*prefix, **to)),
     ):
-        assert ours.dtype == stored(format) and twin.dtype == format.dtype
+        assert ours.dtype == stored(format) and reference.dtype == format.dtype
         if ours.dtype == torch.int8:
-            assert int((ours.int() - twin.int()).abs().max()) <= 1 and float((ours != twin).float().mean()) < 0.02
+            assert (
+                int((ours.int() - reference.int()).abs().max()) <= 1
+                and float((ours != reference).float().mean()) < 0.02
+            )
         else:
-            assert relative(ours.float(), twin.float()) < 0.05
+            assert relative(ours.float(), reference.float()) < 0.05
 
 
 @pytest.mark.parametrize("damage", [torch.nan, torch.inf])
@@ -242,16 +246,17 @@ def test_damage_that_int8_cannot_hold_shows_in_its_row_of_the_stream(damage: flo
 
     numbers, matrix = operands(8, 32, 64, INT8)
     gated = replace(matrix, data=torch.cat((matrix.data, matrix.data)), scale=torch.cat((matrix.scale, matrix.scale)))
-    bias, x, qkv = ones(32), bad(3, 7, 8, 64), bad(3, 90, 8, 96)  # a value of the first of two pictures
+    bias, x, qkv = ones(32), bad(3, 7, 8, 64), bad(3, 90, 8, 96)  # a value of the first of two images
     bias[5] = damage
     gated.scale[5] = damage
     every = list(range(8))
-    for ours, twin, rows in (
+    for ours, reference, rows in (
         (lambda s: product(numbers, matrix, "gelu", bias, stream=s, tile=SMALL[0], **to), plain.linear_gelu, every),
         (lambda s: product(numbers, gated, "geglu", stream=s, tile=SMALL[0], **to), plain.linear_geglu, every),
     ):
-        given = (numbers, matrix, bias) if twin is plain.linear_gelu else (numbers, gated)
-        assert marked(ours) == marked(lambda s, twin=twin, given=given: twin(*given, **to, stream=s)) == rows  # type: ignore[misc]
+        given = (numbers, matrix, bias) if reference is plain.linear_gelu else (numbers, gated)
+        theirs = partial(reference, *given, **to)
+        assert marked(ours) == marked(lambda s, theirs=theirs: theirs(stream=s)) == rows  # type: ignore[misc]
     assert marked(lambda s: activations.geglu(x, **to, stream=s)) == [3]
     for attended in (attention.vision_attention, plain.vision_attention):
         assert marked(lambda s, attended=attended: attended(qkv, 2, 2, **to, stream=s)) == [0, 1, 2, 3]  # type: ignore[misc]

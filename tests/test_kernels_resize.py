@@ -1,4 +1,4 @@
-"""The kernel that resizes pictures: to the last bit what the CPU makes of them."""
+"""The kernel that resizes images: to the last bit what the CPU makes of them."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import gpu_or_interpreter
-from test_resize import SIDE, SIZES, WAYS, picture
+from test_resize import SIDE, SIZES, WAYS, camera_image
 
 from turbopi.config import ImageResize
 from turbopi.engine.resize import Resizer
@@ -14,7 +14,7 @@ from turbopi.preprocess.images import RESIZES, fitted
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.kernels.portable.resize import resize_pictures
+from turbopi.kernels.portable.resize import resize_images
 
 ON_GPU = torch.cuda.is_available()
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -23,12 +23,12 @@ side = SIDE if ON_GPU else 28  # the interpreter is slow
 
 
 def resized(given: Sequence[np.ndarray | None], way: ImageResize) -> np.ndarray:
-    """None: a camera whose picture stays, which is 77 everywhere."""
+    """None: a camera whose image stays, which is 77 everywhere."""
     dtype = torch.float32 if RESIZES[way].float_images else torch.uint8
     images = torch.full((len(given), side, side, 3), 77, dtype=dtype, device=DEVICE)
     resizer = Resizer(images)
     resizer.upload(given, way)
-    resize_pictures(resizer.table, images)
+    resize_images(resizer.table, images)
     return images.cpu().numpy()
 
 
@@ -43,15 +43,15 @@ def check(found: np.ndarray, image: np.ndarray, way: ImageResize) -> None:
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("size", SIZES if ON_GPU else ((37, 53), (28, 80), (100, 61)))
 def test_pictures_are_resized_as_on_a_cpu(size: tuple[int, int], way: ImageResize) -> None:
-    image = picture(*size)
+    image = camera_image(*size)
     check(resized([image], way)[0], image, way)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["openpi", "lerobot"])
 def test_cameras_of_different_sizes_and_layouts_come_each_to_its_place(way: ImageResize) -> None:
-    turned = picture(40, 60).transpose(1, 0, 2)  # not in one piece
-    given = [picture(60, 80), None, turned, picture(side, side)]
+    turned = camera_image(40, 60).transpose(1, 0, 2)  # not in one piece
+    given = [camera_image(60, 80), None, turned, camera_image(side, side)]
     for found, image in zip(resized(given, way), given, strict=True):
         if image is None:
             assert (found == 77).all()

@@ -89,9 +89,9 @@ def exact_sums(rows: int, columns: int, num: int) -> tuple[Tensor, ...]:
 def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int, format: Format) -> None:
     weight, inverse, order, errors, answers = exact_sums(rows, columns, num)
     ours = round_with_feedback(weight, inverse, order, errors, answers, format.dtype)
-    twin = round_with_feedback_plain(weight, inverse, order, errors, answers, format)
-    assert torch.equal(ours.float(), twin.float())
-    assert not torch.equal(twin.float(), format.rounded(weight, inverse[:, None]).float()) or columns == 1
+    reference = round_with_feedback_plain(weight, inverse, order, errors, answers, format)
+    assert torch.equal(ours.float(), reference.float())
+    assert not torch.equal(reference.float(), format.rounded(weight, inverse[:, None]).float()) or columns == 1
 
 
 def in_e4m3(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.portable.vjp import attention
-from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, way_back
+from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, backward_form
 from turbopi.kernels.portable.vjp.tiles import LEAST_ROWS, attention_span, row_block, streaming
 from turbopi.models.pi0.layers import rope_tables
 
@@ -32,14 +32,14 @@ def whole(product: Tensor) -> Tensor:
     return product.float().sum(0).to(DTYPE) if product.dim() == 3 else product
 
 
-def as_its_twin(name: str, *arguments: Any) -> None:
+def as_its_reference(name: str, *arguments: Any) -> None:
     """The kernel against its twin, both against the twin in float32. Outputs of several are compared one by one."""
     wide = [one.float() if isinstance(one, Tensor) and one.is_floating_point() else one for one in arguments]
-    twin, exact = getattr(PLAIN_BACKWARD, name)(*arguments), getattr(PLAIN_BACKWARD, name)(*wide)
+    reference, exact = getattr(PLAIN_BACKWARD, name)(*arguments), getattr(PLAIN_BACKWARD, name)(*wide)
     poison_allocator()
     ours = getattr(FEW_TOKENS, name)(*arguments)
     for found, expected, right in zip(
-        *((x if isinstance(x, tuple) else (x,)) for x in (ours, twin, exact)), strict=True
+        *((x if isinstance(x, tuple) else (x,)) for x in (ours, reference, exact)), strict=True
     ):
         assert_as_good(whole(found), expected, right)
 
@@ -48,13 +48,13 @@ def as_its_twin(name: str, *arguments: Any) -> None:
 def test_feed_forward_and_back(expert: GemmaConfig, tokens: int) -> None:
     d, f = expert.width, expert.mlp_dim
     gate_up, down = random(2 * f, d) / d**0.5, random(d, f) / f**0.5
-    as_its_twin("gate_up", random(tokens, d, outliers=True), gate_up)
-    as_its_twin("down", random(tokens, f, outliers=True), down)
+    as_its_reference("gate_up", random(tokens, d, outliers=True), gate_up)
+    as_its_reference("down", random(tokens, f, outliers=True), down)
     product = random(tokens, 2 * f)
     product[0, 0], product[0, 1] = 30, -30  # where tanh is flat
-    as_its_twin("down_vjp", random(tokens, d), down, product)
-    as_its_twin("gate_up_vjp", random(tokens, 2 * f, outliers=True), gate_up)
-    as_its_twin("out_vjp", random(tokens, d), random(d, expert.num_heads * expert.head_dim) / d**0.5)
+    as_its_reference("down_vjp", random(tokens, d), down, product)
+    as_its_reference("gate_up_vjp", random(tokens, 2 * f, outliers=True), gate_up)
+    as_its_reference("out_vjp", random(tokens, d), random(d, expert.num_heads * expert.head_dim) / d**0.5)
 
 
 def rope(tokens: int, head_dim: int) -> list[Tensor]:
@@ -72,12 +72,12 @@ def test_queries_keys_and_values(expert: GemmaConfig, tokens: int) -> None:
         poison_allocator()
         return [ops.qkv(*given, *turn, k, v), k, v]
 
-    ours, twin, exact = (
+    ours, reference, exact = (
         of(FEW_TOKENS, x, weight),
         of(PLAIN_BACKWARD, x, weight),
         of(PLAIN_BACKWARD, x.float(), weight.float()),
     )
-    for found, expected, right in zip(ours, twin, exact, strict=True):
+    for found, expected, right in zip(ours, reference, exact, strict=True):
         assert_as_good(found, expected, right)
 
 
@@ -111,9 +111,9 @@ def test_attention_and_back(expert: GemmaConfig, tokens: int, state_token: bool,
     seen = (torch.tensor([length], device=DEVICE), slots, n, state_token)
     given = (q, k, v, out, qkv, d)
     wide = tuple(one.float() for one in given)
-    ours, twin = (attention_and_back(ops, given, turn, seen) for ops in (FEW_TOKENS, PLAIN_BACKWARD))
+    ours, reference = (attention_and_back(ops, given, turn, seen) for ops in (FEW_TOKENS, PLAIN_BACKWARD))
     exact = attention_and_back(PLAIN_BACKWARD, wide, turn, seen)
-    for found, expected, right in zip(ours, twin, exact, strict=True):
+    for found, expected, right in zip(ours, reference, exact, strict=True):
         assert_as_good(found, expected, right)
 
 
@@ -216,7 +216,7 @@ def test_a_norm_takes_rows_of_a_table(gated: bool) -> None:
 
 
 def test_other_sizes_keep_the_librarys_products() -> None:
-    assert way_back(FULL, 64) is FEW_TOKENS and way_back(NARROW, 1) is FEW_TOKENS
-    assert way_back(FULL, 65) is BETWEEN_PRODUCTS
+    assert backward_form(FULL, 64) is FEW_TOKENS and backward_form(NARROW, 1) is FEW_TOKENS
+    assert backward_form(FULL, 65) is BETWEEN_PRODUCTS
     for odd in (GemmaConfig(1000, 4096), GemmaConfig(1024, 4100), GemmaConfig(64, 64, 1, 4, 1, 24)):
-        assert way_back(odd, 10) is BETWEEN_PRODUCTS
+        assert backward_form(odd, 10) is BETWEEN_PRODUCTS

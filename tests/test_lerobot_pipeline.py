@@ -297,7 +297,7 @@ def test_any_pipelines_are_read_or_refused_in_one_line(folder: Path) -> None:
         assert mask is None or np.shape(mask) == (7,)
     assert read > 200
     assert len(refusals) > 500
-    assert all("\n" not in told and (PRE in told or POST in told) for told in refusals)
+    assert all("\n" not in reported and (PRE in reported or POST in reported) for reported in refusals)
 
 
 @pytest.mark.slow
@@ -317,4 +317,4 @@ def test_any_config_is_read_or_refused_in_one_line(folder: Path) -> None:
             refusals.append(str(error))
     assert opened > 20
     assert len(refusals) > 20
-    assert not any("\n" in told for told in refusals)
+    assert not any("\n" in reported for reported in refusals)

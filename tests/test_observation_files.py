@@ -16,7 +16,7 @@ from turbopi.cli.files import load_noise
 from turbopi.evaluate.visited import FILE, Visited
 from turbopi.recordings import RecordedCall, iter_recording, load_call, load_observation, save_call
 from turbopi.support.errors import ConfigError, ObservationError
-from turbopi.support.reading.images import read_picture
+from turbopi.support.reading.images import read_image
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 
@@ -28,15 +28,15 @@ def _refused(call: Any) -> str:
     return str(caught.value)
 
 
-# -- pictures ----------------------------------------------------------------------------------------------------------
+# -- images ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", ["png", "webp", "bmp", "ppm"])
 def test_pictures_without_loss_come_back_by_their_content_not_their_name(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"a.{suffix}"
     Image.fromarray(PIXELS).save(file, lossless=True)  # WebP's; the others have no such thing
-    os.rename(file, tmp_path / "picture")
-    assert np.array_equal(read_picture(tmp_path / "picture"), PIXELS)
+    os.rename(file, tmp_path / "image")
+    assert np.array_equal(read_image(tmp_path / "image"), PIXELS)
 
 
 def test_an_eps_never_reaches_ghostscript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,7 +50,7 @@ def test_an_eps_never_reaches_ghostscript(tmp_path: Path, monkeypatch: pytest.Mo
     )
     (tmp_path / "observation.json").write_text('{"image": {"file": "wrist.png"}}')
     message = _refused(lambda: load_observation(tmp_path))
-    assert "wrist.png is neither a readable picture nor .npy" in message and "PNG, JPEG" in message
+    assert "wrist.png is neither a readable image nor .npy" in message and "PNG, JPEG" in message
     assert not started.exists()
 
 
@@ -66,7 +66,7 @@ def _png(width: int, height: int, data: bytes) -> bytes:
 def test_a_decompression_bomb_is_refused_before_it_is_decoded(tmp_path: Path, side: int) -> None:
     """Up to 10 GB of pixels in a file of 80 bytes; of the second Pillow only warns, the last it refuses itself."""
     (tmp_path / "a.png").write_bytes(_png(side, side, zlib.compress(b"")))
-    message = _refused(lambda: read_picture(tmp_path / "a.png"))
+    message = _refused(lambda: read_image(tmp_path / "a.png"))
     assert "pixels" in message
 
 
@@ -76,12 +76,12 @@ def test_a_cut_picture_is_refused(tmp_path: Path, kind: str) -> None:
     data = (tmp_path / "a").read_bytes()
     for length in (0, 1, 10, 40, len(data) // 2):
         (tmp_path / "a").write_bytes(data[:length])
-        assert "is neither a readable picture" in _refused(lambda: read_picture(tmp_path / "a"))
+        assert "is neither a readable image" in _refused(lambda: read_image(tmp_path / "a"))
 
 
 def test_sixteen_bits_a_channel_are_refused_rather_than_clipped(tmp_path: Path) -> None:
     Image.fromarray(np.full((4, 4), 40_000, np.uint16)).save(tmp_path / "depth.png")
-    refused = _refused(lambda: read_picture(tmp_path / "depth.png"))
+    refused = _refused(lambda: read_image(tmp_path / "depth.png"))
     assert re.search("mode I(;16)?; expected 8 bits a channel", refused), refused  # older Pillows: I
 
 

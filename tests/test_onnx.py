@@ -73,7 +73,7 @@ def opened(folder: Path) -> OnnxBackend:
 
 
 def fresh_inputs(kind: Kind, graph: str, length: int, horizon: int) -> dict[str, Tensor]:
-    """Random inputs of a graph, for `length` pictures, prompt or prefix tokens."""
+    """Random inputs of a graph, for `length` images, prompt or prefix tokens."""
     config = golden_model(kind).config
     random = torch.Generator().manual_seed(1000 * length + horizon)
 
@@ -238,7 +238,7 @@ def test_the_exports_that_were_used_last_are_kept(
 
     def used(version: int) -> Path:
         monkeypatch.setattr(kept, "library_versions", lambda: {"torch": str(version)})
-        return kept.kept_export(model).folder
+        return kept.cached_export(model).folder
 
     made = []
     for version in range(kept.KEPT):
@@ -293,8 +293,8 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> Result:
         result = turbopi(*words)
         assert result.exit_code == 0, result.output
     random = np.random.default_rng(0)
-    picture = random.integers(0, 256, (100, 120, 3), dtype=np.uint8)
-    np.savez(root / "seen.npz", front=picture, joints=random.normal(size=8), prompt="fold the towel")
+    camera_image = random.integers(0, 256, (100, 120, 3), dtype=np.uint8)
+    np.savez(root / "seen.npz", front=camera_image, joints=random.normal(size=8), prompt="fold the towel")
     (root / "my_arm.json").unlink()  # the export has its own
     return result
 
@@ -329,8 +329,8 @@ def test_an_export_is_measured_and_told_by_its_hash(tiny: Path) -> None:
     (measured,) = json.loads(bench.stdout)["results"]
     assert (measured["backend"], measured["precision"]) == ("onnx", "f32") and measured["load_seconds"] > 0
     assert "no error against the float32 reference" in bench.stderr
-    told = turbopi("inspect", tiny / "exported", "--hash", "--json")
-    assert json.loads(told.stdout)["sha256"] == open_checkpoint(tiny / "checkpoint").fingerprint()
+    reported = turbopi("inspect", tiny / "exported", "--hash", "--json")
+    assert json.loads(reported.stdout)["sha256"] == open_checkpoint(tiny / "checkpoint").fingerprint()
 
 
 def test_the_policy_opens_an_export_and_a_server_tells_about_it(tiny: Path) -> None:
@@ -502,8 +502,8 @@ def test_the_command_line_takes_the_precision_that_the_backend_has(
     """bf16 is the default of every backend that has it. The same random weights are exported already: copied here."""
     copied = lambda model, to, **_: open_export(shutil.copytree(tiny / "exported", to))  # noqa: E731
     monkeypatch.setattr(kept, "export_onnx", copied)
-    for asked, taken in ((None, "f32"), ("f32", "f32"), ("bf16", "bf16")):
-        assert PolicyOptions(backend="onnx", precision=asked).policy_arguments()["precision"] == taken
+    for requested, taken in ((None, "f32"), ("f32", "f32"), ("bf16", "bf16")):
+        assert PolicyOptions(backend="onnx", precision=requested).policy_arguments()["precision"] == taken
     for backend in ("auto", "pytorch", "fused", "nothing"):
         assert PolicyOptions(backend=backend).policy_arguments()["precision"] == "bf16"
     assert parse_variant("onnx", EvalOptions()) == ("onnx", "f32", None)

@@ -58,7 +58,7 @@ def rounded(x: Tensor, scale: Tensor) -> Tensor:
     return to_fp8(x, scale).float() * scale
 
 
-def twin(calibration: Calibration) -> Pi0Model:
+def emulated(calibration: Calibration) -> Pi0Model:
     checkpoint = golden_folder().checkpoint("pi05")
     model = Pi0Model.from_state(checkpoint.config.model, checkpoint.load("cpu", "f32").state)
     for layer, scales in zip(model.vlm.layers, calibration.scales, strict=False):
@@ -75,7 +75,7 @@ def test_the_graph_equals_pytorch_that_rounds_the_same_operands(folder: Path, ca
     """Where float32 sums differ in the last bit, an operand may fall to the next E4M3 number: hence 1e-3, not 1e-5."""
     observation = golden_cases()["a_three_cams"].observation
     row = type(observation)(*(getattr(observation, f)[:1] for f in observation.__dataclass_fields__))
-    ours, fake = OnnxBackend.open(folder).prefix(row), twin(calibration).prefix(row)
+    ours, fake = OnnxBackend.open(folder).prefix(row), emulated(calibration).prefix(row)
     plain = golden_model("pi05").prefix(row)
     for name in ("k", "v"):
         there, here, exact = getattr(ours, name), getattr(fake, name), getattr(plain, name)
@@ -135,7 +135,7 @@ def test_the_files_build_engines(folder: Path) -> None:
     export, version = open_export(folder), library().version
     with_fp8 = ("prefix",) if tuple(map(int, version.split(".")[:2])) >= (1, 7) else ()
     for graph in ("vision", "denoise_step", *with_fp8):
-        shapes = shapes_of(export, graph, pictures=2, prefix=560, horizon=10)
+        shapes = shapes_of(export, graph, camera_images=2, prefix=560, horizon=10)
         assert len(build_onnx(library(), export.graph(graph), shapes, compute_capability="SM89")) > 1000
 
 
@@ -146,7 +146,7 @@ def test_the_command_exports_fp8_calibrated_on_the_pictures_that_come_with_it(tm
     assert result.exit_code == 0, result.output
     about = json.loads(result.stdout)["calibration"]
     assert about["method"] == "max" and about["observations"] > 1
-    assert about["source"] == "LIBERO pictures that come with Turbo-Pi"
+    assert about["source"] == "LIBERO images that come with Turbo-Pi"
 
 
 def test_the_command_refuses_a_precision_or_calibration_that_makes_no_sense() -> None:

@@ -94,27 +94,29 @@ def test_importing_turbopi_keeps_threads_from_spinning(before: str, given: str |
 
 
 @pytest.fixture
-def told(wheel: Path) -> Message:
+def reported(wheel: Path) -> Message:
     """The wheel's metadata: what an index shows."""
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         return Parser().parsestr(archive.read(name).decode())
 
 
-def test_the_metadata_is_complete(told: Message) -> None:
+def test_the_metadata_is_complete(reported: Message) -> None:
     """`scripts/check_wheel` has twine check the rest."""
-    assert told["License-Expression"] == "Apache-2.0" and told.get_all("License-File") == ["LICENSE", "NOTICE"]
-    assert told["Description-Content-Type"] == "text/markdown" and str(told.get_payload()).startswith("# Turbo-Pi")
-    assert told["Author"] == "the Turbo-Pi authors" and "openpi" in told["Keywords"] and told["Summary"]
-    pythons = [line.rsplit(" ", 1)[1] for line in told.get_all("Classifier", []) if ":: Python :: 3." in line]
+    assert reported["License-Expression"] == "Apache-2.0" and reported.get_all("License-File") == ["LICENSE", "NOTICE"]
+    assert reported["Description-Content-Type"] == "text/markdown" and str(reported.get_payload()).startswith(
+        "# Turbo-Pi"
+    )
+    assert reported["Author"] == "the Turbo-Pi authors" and "openpi" in reported["Keywords"] and reported["Summary"]
+    pythons = [line.rsplit(" ", 1)[1] for line in reported.get_all("Classifier", []) if ":: Python :: 3." in line]
     versions = (ROOT / "docs" / "dev" / "versions.md").read_text()
     assert pythons and all(f"| {python} |" in versions for python in pythons), "those that tests run with"
-    assert set(told.get_all("Provides-Extra", [])) >= {"cuda", "libero", "tensorrt", "onnx", "ray", "rerun"}
+    assert set(reported.get_all("Provides-Extra", [])) >= {"cuda", "libero", "tensorrt", "onnx", "ray", "rerun"}
 
 
-def test_extras_end_at_what_was_tested(told: Message) -> None:
+def test_extras_end_at_what_was_tested(reported: Message) -> None:
     seen = set()
-    for requirement in map(Requirement, told.get_all("Requires-Dist", [])):
+    for requirement in map(Requirement, reported.get_all("Requires-Dist", [])):
         extra = re.search(r'extra == "(\w+)"', str(requirement.marker or ""))
         if extra is not None and extra[1] in ("cuda", "tensorrt", "onnx", "ray", "view"):
             assert {one.operator for one in requirement.specifier} & {"==", "<"}, requirement

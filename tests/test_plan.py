@@ -188,23 +188,23 @@ def test_the_promised_delay_holds_in_the_servers_scheduler(
     phases = data.draw(
         st.lists(st.floats(0.0, 1.0), min_size=plan.robots_per_gpu, max_size=plan.robots_per_gpu), label="phases"
     )
-    asked = [
+    requested = [
         request((phase + round_) * period, within, source=robot)
         for robot, phase in enumerate(phases)
         for round_ in range(4)
     ]
     served = {size: took for size, took in seconds.items() if size <= plan.batch}
-    history = simulate(Schedule(plan.queue_limit, table(served)), asked)
+    history = simulate(Schedule(plan.queue_limit, table(served)), requested)
     assert not history.refused
-    for one in asked:
+    for one in requested:
         turn = history.turn_of(one)
         assert turn is not None and turn.ended <= one.deadline + 1e-6
 
 
 def test_robots_that_ask_together_are_all_served() -> None:
-    asked = [request(source=robot) for robot in range(20)]
+    requested = [request(source=robot) for robot in range(20)]
     for limit, refused in ((ServerOptions.queue_limit, 3), (plan_fleet(Fleet(20, 50, 50), SERIAL).queue_limit, 0)):
-        assert len(simulate(Schedule(limit, table(SERIAL)), asked).refused) == refused
+        assert len(simulate(Schedule(limit, table(SERIAL)), requested).refused) == refused
 
 
 @SETTINGS
@@ -213,13 +213,13 @@ def test_robots_without_deadlines_wait_no_longer_either(seconds: dict[int, float
     """As openpi's clients, which say nothing; but for the moment that the server waits for company."""
     robots = len(phases)
     worst = worst_seconds(batch_times(seconds, max(seconds)), robots)
-    asked = [
+    requested = [
         request(worst * (phase + round_), 1e3, source=robot)
         for robot, phase in enumerate(phases)
         for round_ in range(3)
     ]
-    history = simulate(Schedule(10 * robots, table(seconds)), asked)
-    for one in asked:
+    history = simulate(Schedule(10 * robots, table(seconds)), requested)
+    for one in requested:
         turn = history.turn_of(one)
         assert turn is not None and turn.ended - one.arrived <= worst + history.idle + 1e-9
 
@@ -356,16 +356,18 @@ def test_a_prediction_is_called_one() -> None:
 
 
 def test_a_plan_without_times_of_batches_says_so() -> None:
-    told = "Batches of such chunks weren't measured there: `turbopi bench --horizons 10 --batch 1,2,4,8`, then --times"
+    reported = (
+        "Batches of such chunks weren't measured there: `turbopi bench --horizons 10 --batch 1,2,4,8`, then --times"
+    )
     ask = ["--hz", "20", "--horizon", "10", "--gpu", "h200", "--precision", "int8"]
-    assert told in turbopi("plan", "--robots", "12", *ask).stdout.splitlines()
-    assert told not in turbopi("plan", "--robots", "1", *ask).stdout
+    assert reported in turbopi("plan", "--robots", "12", *ask).stdout.splitlines()
+    assert reported not in turbopi("plan", "--robots", "1", *ask).stdout
     for gpu in ("h100", "h200"):
         assert "weren't measured" not in turbopi(*ASK, "--gpu", gpu).stdout
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("requested", "reported"),
     [
         ("--robots 17 --horizon 50 --execution-horizon 50", "Robots carry out whole chunks, and stand still"),
         ("--robots 16 --horizon 50 --gpus 4", "Without Ray, a server on each GPU: 2 control steps"),
@@ -373,11 +375,11 @@ def test_a_plan_without_times_of_batches_says_so() -> None:
         ("--robots 300 --horizon 50", "One server decodes some 500 observations a second: take 2 servers"),
     ],
 )
-def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(asked: str, told: str) -> None:
+def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(requested: str, reported: str) -> None:
     from test_document_commands import check_parses
 
-    lines = turbopi("plan", "--hz", "50", "--gpu", "h200", *asked.split()).stdout.splitlines()
-    assert any(line.startswith(told) for line in lines)
+    lines = turbopi("plan", "--hz", "50", "--gpu", "h200", *requested.split()).stdout.splitlines()
+    assert any(line.startswith(reported) for line in lines)
     (run,) = (line for line in lines if line.startswith("run "))
     assert all(len(line) <= 110 for line in lines if line != run)
     words = run.split()[2:]
@@ -386,7 +388,7 @@ def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(as
     given = dict(itertools.pairwise(words))
     assert given.get("--replicas", "1") == gpus.rstrip(",") and ("--ray" in words) == (gpus != "1,")
     assert int(given.get("--queue-limit", 16)) == max(16, int(most))
-    assert int(given.get("--max-clients", 256)) == max(256, int(asked.split()[1]))
+    assert int(given.get("--max-clients", 256)) == max(256, int(requested.split()[1]))
 
 
 @pytest.mark.parametrize(
@@ -411,8 +413,8 @@ def test_the_documents_table_is_what_the_command_prints(gpu: str, precision: str
     for robots, (hz, horizon) in [(8, fleet_table.CONTROL[0]), (64, fleet_table.CONTROL[1])]:
         (row,) = (line for line in text.splitlines() if line.startswith(f"| {robots}, {hz:g} Hz, H = {horizon} |"))
         cell = row.split("|")[2 + column].strip()
-        asked = ["--robots", robots, "--hz", hz, "--horizon", horizon, "--gpu", gpu, "--precision", precision]
-        said = turbopi("plan", *asked)
+        requested = ["--robots", robots, "--hz", hz, "--horizon", horizon, "--gpu", gpu, "--precision", precision]
+        said = turbopi("plan", *requested)
         if cell == "no":
             assert "can't do it for a single robot" in refusal(said)
         else:

@@ -1,4 +1,4 @@
-"""Pictures: openpi's way bit for bit, LeRobot's against an independent computation, refusals."""
+"""Images: openpi's way bit for bit, LeRobot's against an independent computation, refusals."""
 
 import re
 import subprocess
@@ -67,13 +67,20 @@ def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
 ) -> None:
     monkeypatch.setattr(images, "_cores", lambda: cores)
     images._threads.cache_clear()
-    pictures = [noise(h, w, 3, seed=h) for h, w in SIZES]
-    turned = [one.transpose(1, 0, 2) for one in pictures]
-    for given_ in (pictures, turned, [pictures[0]], [pictures[0], noise(30, 40, 3)], [noise(30, 40, 3)], []):
+    camera_images = [noise(h, w, 3, seed=h) for h, w in SIZES]
+    turned = [one.transpose(1, 0, 2) for one in camera_images]
+    for given_ in (
+        camera_images,
+        turned,
+        [camera_images[0]],
+        [camera_images[0], noise(30, 40, 3)],
+        [noise(30, 40, 3)],
+        [],
+    ):
         for found, one in zip(all_fitted(given_, 224, way), given_, strict=True):
             np.testing.assert_array_equal(found, fitted(one, 224, way), strict=True)
     with pytest.raises(ObservationError, match="1x300000 pixels is too narrow"):
-        all_fitted([pictures[0], noise(1, 300000, 3)], 224, way)
+        all_fitted([camera_images[0], noise(1, 300000, 3)], 224, way)
     images._threads.cache_clear()
 
 
@@ -83,10 +90,10 @@ def test_a_forked_child_has_threads_of_its_own() -> None:
 import os, numpy as np
 from turbopi.preprocess import images
 images._cores = lambda: 2
-pictures = [np.ones((480, 640, 3), np.uint8)] * 2
-images.all_fitted(pictures, 224, "openpi")
+images = [np.ones((480, 640, 3), np.uint8)] * 2
+images.all_fitted(images, 224, "openpi")
 child = os.fork()
-images.all_fitted(pictures, 224, "openpi")
+images.all_fitted(images, 224, "openpi")
 if child:
     assert os.waitpid(child, 0)[1] == 0
 """
@@ -130,16 +137,16 @@ def test_a_first_axis_of_three_counts_as_chw() -> None:
 BAD: list[tuple[Any, str]] = [
     (np.zeros((20, 30, 3), np.int64), "cam has dtype int64; send uint8"),
     (np.zeros((20, 30, 3), np.bool_), "cam has dtype bool"),
-    (np.array("picture"), "cam has dtype <U7"),
-    (np.zeros((20, 30), np.uint8), r"cam has shape \(20, 30\); send one picture"),
+    (np.array("image"), "cam has dtype <U7"),
+    (np.zeros((20, 30), np.uint8), r"cam has shape \(20, 30\); send one image"),
     (np.zeros((1, 20, 30, 3), np.uint8), "without a batch axis"),
     (np.zeros((0, 30, 3), np.uint8), "cam is empty"),
     (np.zeros((20, 30, 4), np.uint8), r"cam has shape \(20, 30, 4\); one axis"),
     (np.zeros((20, 30, 1), np.uint8), r"cam has shape \(20, 30, 1\); one axis"),
-    (np.full((20, 30, 3), 255.0), "cam is a float picture with values from 255 to 255"),
-    (np.full((20, 30, 3), -0.1), "cam is a float picture with values from -0.1"),
-    (np.full((20, 30, 3), np.nan), "cam is a float picture with values from nan"),
-    ([[[1, 2, 3], [1, 2]]], "cam isn't a picture"),
+    (np.full((20, 30, 3), 255.0), "cam is a float image with values from 255 to 255"),
+    (np.full((20, 30, 3), -0.1), "cam is a float image with values from -0.1"),
+    (np.full((20, 30, 3), np.nan), "cam is a float image with values from nan"),
+    ([[[1, 2, 3], [1, 2]]], "cam isn't an image"),
     (None, "cam has dtype object"),
 ]
 
@@ -152,7 +159,7 @@ def test_what_is_no_picture_is_refused(value: Any, message: str) -> None:
 
 
 def test_chw_robots_refuse_hwc() -> None:
-    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 3\), but this robot's pictures are CHW"):
+    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 3\), but this robot's images are CHW"):
         parse_chw_image(noise(20, 30, 3), "cam_high")
 
 

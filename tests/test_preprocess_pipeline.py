@@ -192,8 +192,8 @@ def test_the_observation_is_neither_changed_nor_kept() -> None:
     np.testing.assert_equal(observation, untouched)
     images, values = inputs.images.copy(), state.copy()
     observation["state"][:] = 9
-    for picture in observation["images"].values():
-        picture[:] = 9
+    for camera_image in observation["images"].values():
+        camera_image[:] = 9
     np.testing.assert_array_equal(inputs.images, images)
     np.testing.assert_array_equal(state, values)
 
@@ -275,8 +275,10 @@ class Relative(Robot):
 def test_cameras_that_a_robot_leaves_out_are_masked_and_order_doesnt_matter() -> None:
     class Wrist(Relative):
         def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
-            pictures = {camera: np.full((224, 224, 3), i, np.uint8) for i, camera in enumerate(reversed(CAMERAS[:2]))}
-            return RobotInputs(pictures, dict.fromkeys(pictures, True), observation["state"])
+            camera_images = {
+                camera: np.full((224, 224, 3), i, np.uint8) for i, camera in enumerate(reversed(CAMERAS[:2]))
+            }
+            return RobotInputs(camera_images, dict.fromkeys(camera_images, True), observation["state"])
 
     edges = pipeline(PLAIN, 7, 7, robot=Wrist())
     inputs, _ = edges.before(edges.example())
@@ -287,8 +289,8 @@ def test_cameras_that_a_robot_leaves_out_are_masked_and_order_doesnt_matter() ->
 def test_a_masked_picture_is_never_read() -> None:
     class Masked(Relative):
         def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
-            pictures = {"base_0_rgb": np.zeros((5, 5), np.int64)}  # would be refused
-            return RobotInputs(pictures, {"base_0_rgb": False}, observation["state"])
+            camera_images = {"base_0_rgb": np.zeros((5, 5), np.int64)}  # would be refused
+            return RobotInputs(camera_images, {"base_0_rgb": False}, observation["state"])
 
     edges = pipeline(PLAIN, 7, 7, robot=Masked())
     inputs, _ = edges.before(edges.example())
@@ -406,7 +408,7 @@ def test_whatever_an_observation_holds_it_is_used_or_refused_as_such(edges: Pipe
     assert np.isfinite(edges.after(np.zeros((2, 32), np.float32), state)["actions"]).all()
 
 
-@pytest.mark.parametrize("observation", [None, [1], "picture", 3])
+@pytest.mark.parametrize("observation", [None, [1], "image", 3])
 def test_an_observation_is_a_dict(observation: Any) -> None:
     with pytest.raises(ObservationError, match=f"an observation is a dict, got {type(observation).__name__}"):
         pipeline(LIBERO).before(observation)
@@ -451,8 +453,8 @@ def test_cameras_of_a_robot_that_has_the_models_order_keep_it_whatever_their_nam
     keys = ["left_wrist_0_rgb", "base_0_rgb"]
     options = {"image_keys": keys, "state_dim": 6, "action_dim": 5}
     edges = pipeline(dataclasses.replace(LIBERO, robot="lerobot", robot_options=options), 6, 5)
-    pictures = {key: np.full((3, 224, 224), shade, np.uint8) for key, shade in zip(keys, (10, 20), strict=True)}
-    inputs, _ = edges.before({**pictures, "observation.state": np.zeros(6), "task": "go"})
+    camera_images = {key: np.full((3, 224, 224), shade, np.uint8) for key, shade in zip(keys, (10, 20), strict=True)}
+    inputs, _ = edges.before({**camera_images, "observation.state": np.zeros(6), "task": "go"})
     assert [int(image[0, 0, 0]) for image in inputs.images] == [10, 20]
 
 
@@ -480,7 +482,7 @@ def test_states_too_large_for_the_model_are_refused(huge: float) -> None:
 
 def test_pictures_too_narrow_to_resize_are_refused() -> None:
     edges = pipeline(LIBERO)
-    with pytest.raises(ObservationError, match="a picture of 1x500 pixels is too narrow"):
+    with pytest.raises(ObservationError, match="an image of 1x500 pixels is too narrow"):
         edges.before({**edges.example(), "observation/image": np.zeros((1, 500, 3), np.uint8)})
 
 
@@ -576,11 +578,11 @@ def test_vision_is_given_the_valid_pictures_that_before_returns(resize: Any) -> 
         observation = {"images": dict(zip(CAMERAS, sent, strict=False)), "state": np.full(8, 0.5)}
         inputs, state = edges.before(observation)
         seen = edges.see(observation)
-        assert len(seen.pictures) == len(sent)
-        np.testing.assert_array_equal(np.stack(seen.pictures), inputs.images[inputs.image_mask])
-        assert np.stack(seen.pictures).dtype == inputs.images.dtype
+        assert len(seen.camera_images) == len(sent)
+        np.testing.assert_array_equal(np.stack(seen.camera_images), inputs.images[inputs.image_mask])
+        assert np.stack(seen.camera_images).dtype == inputs.images.dtype
         if resize == "openpi" and sent[-1] is exact:
-            assert np.shares_memory(seen.pictures[-1], exact)
+            assert np.shares_memory(seen.camera_images[-1], exact)
         edges.read(seen)
         np.testing.assert_array_equal(seen.state, state)
         np.testing.assert_array_equal(seen.model_state, inputs.state)

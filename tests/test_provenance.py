@@ -32,7 +32,7 @@ def repository(folder: Path, *files: str) -> str:
     return git(folder, "rev-parse", "--short=12", "HEAD")
 
 
-def told(monkeypatch: pytest.MonkeyPatch, file: Path) -> str:
+def reported(monkeypatch: pytest.MonkeyPatch, file: Path) -> str:
     """The commit that is recorded if provenance.py is this file."""
     monkeypatch.setattr(module, "__file__", str(file))
     return provenance(torch.device("cpu")).commit
@@ -47,9 +47,9 @@ def test_a_checkout_of_ours_is_told_by_its_commit_and_by_its_changes(
 ) -> None:
     name = "src/turbopi/support/provenance.py"
     commit = repository(tmp_path, name)
-    assert told(monkeypatch, tmp_path / name) == commit
+    assert reported(monkeypatch, tmp_path / name) == commit
     (tmp_path / "README").write_text("changed")
-    assert told(monkeypatch, tmp_path / name) == f"{commit}+"
+    assert reported(monkeypatch, tmp_path / name) == f"{commit}+"
 
 
 @pytest.mark.parametrize("tracked", [False, True])
@@ -62,9 +62,9 @@ def test_a_repository_around_the_installation_isnt_taken_for_ours(
     repository(tmp_path, *([installed] if tracked else []))
     (tmp_path / installed).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / installed).write_text("installed")
-    assert told(monkeypatch, tmp_path / installed) == "unknown"
+    assert reported(monkeypatch, tmp_path / installed) == "unknown"
     monkeypatch.setenv("TURBOPI_COMMIT", "abc")
-    assert told(monkeypatch, tmp_path / installed) == "abc"
+    assert reported(monkeypatch, tmp_path / installed) == "abc"
 
 
 def test_a_repository_that_the_environment_names_is_no_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +74,7 @@ def test_a_repository_that_the_environment_names_is_no_matter(tmp_path: Path, mo
     repository(tmp_path / "theirs", name)
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "theirs" / ".git"))
     monkeypatch.setenv("GIT_WORK_TREE", str(tmp_path / "theirs"))
-    assert told(monkeypatch, tmp_path / "ours" / name) == commit
+    assert reported(monkeypatch, tmp_path / "ours" / name) == commit
 
 
 @pytest.mark.parametrize(

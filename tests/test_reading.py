@@ -154,7 +154,7 @@ def test_fields_of_another_type_are_refused_by_name_and_value(read: Any, message
 # -- arrays ------------------------------------------------------------------------------------------------------------
 
 ARRAYS: dict[str, np.ndarray] = {
-    "picture": np.arange(48, dtype=np.uint8).reshape(4, 4, 3),
+    "image": np.arange(48, dtype=np.uint8).reshape(4, 4, 3),
     "state": np.linspace(-1, 1, 8),
     "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
     "empty": np.zeros((0, 3), np.float32),
@@ -277,7 +277,7 @@ def test_every_single_byte_of_an_npz_is_checked(tmp_path: Path) -> None:
     """Each byte damaged in turn: the arrays come back unchanged, or one line says that they can't."""
     for save in SAVES:
         stream = io.BytesIO()
-        save(stream, **{name: ARRAYS[name] for name in ("picture", "prompt")})
+        save(stream, **{name: ARRAYS[name] for name in ("image", "prompt")})
         good, file = stream.getvalue(), tmp_path / "a.npz"
         refused = 0
         for place in range(len(good)):

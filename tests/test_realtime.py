@@ -36,14 +36,14 @@ def test_the_robot_never_waits_for_a_policy_that_is_as_fast_as_expected(executio
     report = loop.executor.report()
     assert report["delays"]["max"] == report["delays"]["median"] == report["expected_delay"] == 2
     assert not report["dropped"] and not report["late"]
-    told = [call["previous"] for call in policy.calls]
-    assert told[0] is None
+    reported = [call["previous"] for call in policy.calls]
+    assert reported[0] is None
     if execution in RTC:
-        for previous in told[1:]:
+        for previous in reported[1:]:
             assert (previous.delay, previous.execution_horizon, previous.mode) == (2, 4, execution)
             assert len(previous.left_over) == 6
     else:
-        assert told == [None] * len(told) and not any(call["model_actions"] for call in policy.calls)
+        assert reported == [None] * len(reported) and not any(call["model_actions"] for call in policy.calls)
 
 
 def test_an_observation_is_wanted_from_the_execution_horizon_until_the_chunk_is_there() -> None:
@@ -67,7 +67,7 @@ def test_each_chunk_and_each_seam_can_be_looked_up() -> None:
     assert [(one.chunk, one.begun, one.ended, one.outcome) for one in inferred[:3]] == [
         *((0, 0, 2, "used"), (1, 6, 8, "used"), (2, 10, 12, "used")),
     ]
-    assert [(seam.chunk, seam.step, seam.delay, seam.told) for seam in seams[:2]] == [(1, 8, 2, 2), (2, 12, 2, 2)]
+    assert [(seam.chunk, seam.step, seam.delay, seam.reported) for seam in seams[:2]] == [(1, 8, 2, 2), (2, 12, 2, 2)]
     inferred[0].outcome = "changed"
     assert loop.executor.inferred[0].outcome == "used"
 
@@ -122,8 +122,10 @@ def test_a_slow_first_call_is_not_expected_again() -> None:
     loop.hand.at_once = True
     assert loop.executor.warm_up({"place": 0}) > 40
     assert loop.executor.report()["expected_delay"] == 1
-    told = [call["previous"] for call in policy.calls]
-    assert told[0] is None and all(previous.execution_horizon == 4 for previous in told[1:])  # both ways are warm
+    reported = [call["previous"] for call in policy.calls]
+    assert reported[0] is None and all(
+        previous.execution_horizon == 4 for previous in reported[1:]
+    )  # both ways are warm
 
 
 def test_without_a_warm_up_the_first_observation_warms_up_in_the_background() -> None:
@@ -208,10 +210,10 @@ def test_a_server_that_keeps_the_running_chunk_is_told_what_it_must_know() -> No
     assert [call["obs"].get("turbopi/reset") for call in policy.calls] == [True] * 3
     policy.calls.clear()
     loop.run(20, delay=1)
-    told = [{key: value for key, value in call["obs"].items() if key != "place"} for call in policy.calls]
+    reported = [{key: value for key, value in call["obs"].items() if key != "place"} for call in policy.calls]
     own = {"turbopi/execution_horizon": 4}
-    assert told[0] == {"turbopi/reset": True, "turbopi/step": 0, "turbopi/delay": 0, **own}
-    assert told[1] == {"turbopi/reset": False, "turbopi/step": 4, "turbopi/delay": 1, **own}
+    assert reported[0] == {"turbopi/reset": True, "turbopi/step": 0, "turbopi/delay": 0, **own}
+    assert reported[1] == {"turbopi/reset": False, "turbopi/step": 4, "turbopi/delay": 1, **own}
     loop.run(12, delay=9)  # longer than fits: H − s = 6
     loop.run(6, delay=0)
     assert executor.report()["expected_delay"] == 9

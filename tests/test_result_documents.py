@@ -36,7 +36,7 @@ class Outer(Struct, frozen=True):
     format: Literal[1]
     by_name: dict[str, Inner]
     rows: list[Inner]
-    told: Mapping[str, object]
+    reported: Mapping[str, object]
     limit: int | float | None
     name: Annotated[str, Meta(pattern=r"\S")]
 
@@ -45,7 +45,7 @@ GOOD = {
     "format": 1,
     "by_name": {"a name": {"count": 1}},
     "rows": [{"count": 2, "kind": "other", "pair": [3, 4.5], "share": 0.5}],
-    "told": {"anything": [1, {"x": None}]},
+    "reported": {"anything": [1, {"x": None}]},
     "limit": 3,
     "name": "a",
 }
@@ -63,7 +63,7 @@ def test_numpys_numbers_and_paths_are_written_as_jsons() -> None:
     inner = Inner(np.int64(3), share=np.float64(0.5))
     assert json.dumps(plain_document(inner)) == '{"count": 3, "kind": "one", "pair": [1, 2.0], "share": 0.5}'
     outer = Outer(1, {}, [], {"file": Path("a/b"), "version": torch.__version__}, None, "a")
-    assert plain_document(outer)["told"] == {"file": "a/b", "version": str(torch.__version__)}
+    assert plain_document(outer)["reported"] == {"file": "a/b", "version": str(torch.__version__)}
     with pytest.raises(TypeError, match="a document holds <object obj"):
         plain_document(Outer(1, {}, [], {"x": object()}, None, "a"))
 
@@ -86,7 +86,7 @@ def test_numpys_numbers_and_paths_are_written_as_jsons() -> None:
         ({"rows": [{"count": 1, "pair": [1, "x"]}]}, "rows[0].pair[1] is 'x'; expected a finite number"),
         ({"rows": [{"count": 1, "share": -1}]}, "rows[0].share is -1; expected a finite number from 0 or null"),
         ({"rows": [{"count": 1, "share": "x"}]}, "rows[0].share is 'x'; expected a finite number from 0 or null"),
-        ({"told": None}, "told is None; expected an object"),
+        ({"reported": None}, "reported is None; expected an object"),
         ({"limit": "x"}, "limit is 'x'; expected a finite number or null"),
         ({"name": " "}, "name is ' '; expected a text that isn't blank"),
     ],
@@ -96,9 +96,9 @@ def test_a_wrong_value_is_named_with_its_way_and_what_was_expected(
 ) -> None:
     file = tmp_path / "document.json"
     file.write_text(json.dumps(GOOD | change))
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as reported:
         read_document(file, Outer, ConfigError, hint="; make it again")
-    assert str(told.value) == f"{file}: {said}; make it again"
+    assert str(reported.value) == f"{file}: {said}; make it again"
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_wrong_value_is_named_with_its_way_and_what_was_expected(
         ('{"limit": NaN}', "limit is nan, which no JSON has"),
         ('{"limit": 1e999}', "beyond float64"),
         (f'{{"limit": {"9" * 30}}}', "beyond 64 bits"),
-        (f'{{"told": {"[" * 70}{"]" * 70}}}', "more than 64 deep"),
+        (f'{{"reported": {"[" * 70}{"]" * 70}}}', "more than 64 deep"),
         ('{"limit": 1, "limit": 2}', "the key 'limit' is given twice"),
         ("[]", "expected an object"),
     ],

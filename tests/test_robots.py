@@ -219,7 +219,7 @@ def test_aloha_refuses_cameras_that_openpi_doesnt_know() -> None:
     example["images"]["cam_higher"] = example["images"]["cam_high"]
     with pytest.raises(ObservationError, match="unexpected cameras in images: cam_higher; expected cam_high, "):
         CREATED["aloha"].inputs(example)
-    with pytest.raises(ObservationError, match="'images' is a list, expected a dict of pictures"):
+    with pytest.raises(ObservationError, match="'images' is a list, expected a dict of images"):
         CREATED["aloha"].inputs({**example, "images": [1]})
 
 
@@ -317,8 +317,8 @@ def test_lerobots_names_and_new_names_are_both_read_and_the_later_wins() -> None
         ("observation.images.a", "observation.images.top"),
         ("observation.images.top", "observation.images.a"),
     ):
-        pictures = {name: np.full((3, 8, 8), shades[name], np.uint8) for name in names}
-        inputs = robot.inputs({**pictures, "observation.state": np.arange(6.0), "task": "go"})
+        camera_images = {name: np.full((3, 8, 8), shades[name], np.uint8) for name in names}
+        inputs = robot.inputs({**camera_images, "observation.state": np.arange(6.0), "task": "go"})
         assert inputs.images["observation.images.top"].max() == shades[names[-1]]
         assert inputs.state.tolist() == [0, 1, 2, 3, 4, 5]
     with pytest.raises(ObservationError, match=r"expected .*observation\.joints"):
@@ -391,16 +391,16 @@ def test_the_plain_robot_masks_what_it_isnt_given_and_refuses_other_names() -> N
 def test_the_plain_robots_masked_cameras_are_as_if_not_sent() -> None:
     plain = create_robot("plain")
     example = plain.example(np.random.default_rng(0))
-    pictures, rest = example.pop("images"), example
+    camera_images, rest = example.pop("images"), example
     for mask in (
         {"image_mask": {"base_0_rgb": True, "right_wrist_0_rgb": False}},
         {"image_mask/right_wrist_0_rgb": np.False_},
         {"image_mask": {"right_wrist_0_rgb": np.array([False])}},
     ):
-        inputs = plain.inputs({"image": pictures, **rest, **mask})
+        inputs = plain.inputs({"image": camera_images, **rest, **mask})
         assert inputs.image_mask == {"base_0_rgb": True, "left_wrist_0_rgb": True, "right_wrist_0_rgb": False}
         assert not inputs.images["right_wrist_0_rgb"].any()
-    del pictures["left_wrist_0_rgb"]
+    del camera_images["left_wrist_0_rgb"]
     for wrong, message in (
         ({"left_wrist_0_rgb": True}, "image_mask/left_wrist_0_rgb is True, but image has no left_wrist_0_rgb"),
         ({"wrist": True}, "image_mask/wrist is of no camera; the model's are base_0_rgb"),
@@ -411,7 +411,7 @@ def test_the_plain_robots_masked_cameras_are_as_if_not_sent() -> None:
         (3, "'image_mask' is a int, expected a dict"),
     ):
         with pytest.raises(ObservationError, match=message):
-            plain.inputs({"image": pictures, **rest, "image_mask": wrong})
+            plain.inputs({"image": camera_images, **rest, "image_mask": wrong})
 
 
 @pytest.mark.parametrize("value", ["no", "false", None, 0, 0.0, []])

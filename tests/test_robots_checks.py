@@ -231,8 +231,10 @@ def arm_json(tmp_path: Path) -> Path:
 def test_the_option_is_the_same_text_everywhere(command: str) -> None:
     shown = text_of(turbopi(command, "--help").stdout)
     assert "--robot NAME|FILE|CLASS" in shown
-    told = "Instead of the configuration's robot: a built-in one, a type of LeRobot's (so101_follower), a description"
-    assert told in shown
+    reported = (
+        "Instead of the configuration's robot: a built-in one, a type of LeRobot's (so101_follower), a description"
+    )
+    assert reported in shown
 
 
 def test_inspect_shows_the_robots_keys_and_what_to_look_at(arm_json: Path) -> None:
@@ -278,8 +280,8 @@ def test_convert_records_a_built_in_robot_and_no_class(tmp_path: Path) -> None:
 def test_calibrate_reads_the_robots_keys(arm_json: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for number in range(3):
-        picture, joints = rng.integers(256, size=(32, 32, 3), dtype=np.uint8), rng.uniform(-1, 1, 6)
-        np.savez(tmp_path / f"{number}.npz", front=picture, joints=joints)
+        camera_image, joints = rng.integers(256, size=(32, 32, 3), dtype=np.uint8), rng.uniform(-1, 1, 6)
+        np.savez(tmp_path / f"{number}.npz", front=camera_image, joints=joints)
     recording = tmp_path / "observations"
     recording.mkdir()
     for number in range(3):

@@ -32,8 +32,8 @@ def robot(name: Any = "so101_follower", **changed: Any) -> Robot:
 def observation(**changed: Any) -> dict[str, Any]:
     """As LeRobot's SO-101 gives it, with the task beside it."""
     rng = np.random.default_rng(0)
-    pictures = {name: rng.integers(256, size=(48, 64, 3), dtype=np.uint8) for name in ("front", "wrist")}
-    made = {**{key: 10.0 * i for i, key in enumerate(SO101)}, **pictures, "task": "fold the towel"}
+    camera_images = {name: rng.integers(256, size=(48, 64, 3), dtype=np.uint8) for name in ("front", "wrist")}
+    made = {**{key: 10.0 * i for i, key in enumerate(SO101)}, **camera_images, "task": "fold the towel"}
     return {key: value for key, value in (made | changed).items() if value is not None}
 
 
@@ -53,8 +53,8 @@ def test_raw_keys_are_the_checkpoints_keys(name: str) -> None:
     own = create_robot("lerobot", OPTIONS).inputs({**keyed, "observation.state": state, "task": sent["task"]})
     np.testing.assert_array_equal(raw.state, own.state, strict=True)
     assert list(raw.images) == list(own.images) and raw.image_mask == own.image_mask
-    for camera, picture in own.images.items():
-        np.testing.assert_array_equal(raw.images[camera], picture)
+    for camera, camera_image in own.images.items():
+        np.testing.assert_array_equal(raw.images[camera], camera_image)
     assert (raw.prompt, raw.in_order) == ("fold the towel", True)
 
 

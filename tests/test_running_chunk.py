@@ -21,7 +21,7 @@ from turbopi.checkpoint.convert import convert
 from turbopi.config import RealTime
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.models.pi0.denoise import time_grid
-from turbopi.policy.chunk_conditioning import Joining
+from turbopi.policy.chunk_conditioning import ChunkConditioning
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
@@ -59,29 +59,29 @@ def policy() -> UnifiedPolicy:
 def test_guided_modes_pull_towards_the_left_over_before_h_minus_s() -> None:
     left_over = rows(7)
     for mode, guidance in (("rtc", "jacobian"), ("rtc_identity", "identity")):
-        asked = conditioning(RunningChunk(left_over, 2, 4, mode=mode))  # type: ignore[arg-type]
-        assert asked.guidance is not None and asked.guidance.mode == guidance and asked.held is None
-        np.testing.assert_array_equal(asked.guidance.target[:7], left_over)
-        np.testing.assert_array_equal(asked.guidance.weights, guidance_weights(H, 2, 4))
+        requested = conditioning(RunningChunk(left_over, 2, 4, mode=mode))  # type: ignore[arg-type]
+        assert requested.guidance is not None and requested.guidance.mode == guidance and requested.held is None
+        np.testing.assert_array_equal(requested.guidance.target[:7], left_over)
+        np.testing.assert_array_equal(requested.guidance.weights, guidance_weights(H, 2, 4))
         times = np.repeat(time_grid(4)[:, None], H, 1)
-        np.testing.assert_array_equal(asked.guidance.strength, guidance_strength(times, 5.0))
+        np.testing.assert_array_equal(requested.guidance.strength, guidance_strength(times, 5.0))
 
 
 def test_nothing_pulls_towards_what_is_not_there() -> None:
     for s in (None, 2):
-        asked = conditioning(RunningChunk(rows(6), 2, s))
-        assert asked.guidance is not None
-        np.testing.assert_array_equal(asked.guidance.weights, guidance_weights(H, 2, 4))
+        requested = conditioning(RunningChunk(rows(6), 2, s))
+        assert requested.guidance is not None
+        np.testing.assert_array_equal(requested.guidance.weights, guidance_weights(H, 2, 4))
     assert completed(RunningChunk(rows(10), 0)).execution_horizon == 1
     assert completed(RunningChunk(rows(10), 4)).execution_horizon == 4, "as many are carried out meanwhile"
 
 
 def test_the_policys_options_are_taken_where_the_chunk_says_nothing() -> None:
     options = RealTime(execution_horizon=6, schedule="linear", max_guidance_weight=10.0)
-    asked = conditioning(RunningChunk(rows(8), 2), options).guidance
-    assert asked is not None
-    np.testing.assert_array_equal(asked.weights, guidance_weights(H, 2, 6, "linear"))
-    assert asked.strength.max() == 10
+    requested = conditioning(RunningChunk(rows(8), 2), options).guidance
+    assert requested is not None
+    np.testing.assert_array_equal(requested.weights, guidance_weights(H, 2, 6, "linear"))
+    assert requested.strength.max() == 10
     assert completed(RunningChunk(rows(8), 7), options).execution_horizon == 3, "a long delay cuts it"
     own = completed(RunningChunk(rows(8), 2, 3, schedule="ones", max_guidance_weight=1.0), options)
     assert (own.execution_horizon, own.schedule, own.max_guidance_weight) == (3, "ones", 1.0)
@@ -103,9 +103,9 @@ def test_identity_without_an_execution_horizon_has_lerobots_mask(
 ) -> None:
     """LeRobot's execution_horizon is the mask's end e, which a checkpoint's options hold as s = H − e, or None."""
     options = RealTime(execution_horizon=H - end if end < H else None, schedule="linear", max_guidance_weight=10.0)
-    asked = conditioning(RunningChunk(rows(left), delay, mode="rtc_identity"), options).guidance
-    assert asked is not None
-    np.testing.assert_allclose(asked.weights, expected, rtol=1e-6)
+    requested = conditioning(RunningChunk(rows(left), delay, mode="rtc_identity"), options).guidance
+    assert requested is not None
+    np.testing.assert_allclose(requested.weights, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("horizon", "s"), [(8, 2), (10, 4), (12, 6), (5, 1)])
@@ -114,7 +114,7 @@ def test_identitys_mask_ends_where_it_does_in_chunks_of_another_length(
 ) -> None:
     """Of a policy whose mask ends at 6; a shorter chunk's ends with the left-over of 4."""
     config = dataclasses.replace(policy.config, real_time=RealTime(execution_horizon=H - 6))
-    joining = Joining(config, policy._pipeline, policy.backend)
+    joining = ChunkConditioning(config, policy._pipeline, policy.backend)
     ((_, chunk),) = joining.checked([None], [RunningChunk(rows(4), 1, mode="rtc_identity")], 2, horizon).rows
     assert chunk is not None and chunk.execution_horizon == s
 
@@ -126,10 +126,10 @@ def test_identity_with_an_execution_horizon_of_its_own_needs_room_for_the_delay(
 
 def test_trained_mode_holds_what_will_be_carried_out() -> None:
     left_over = rows(7)
-    asked = conditioning(RunningChunk(left_over, 3, mode="rtc_trained"))
-    assert asked.guidance is None and asked.held is not None and asked.values is not None
-    np.testing.assert_array_equal(asked.held, np.arange(H) < 3)
-    np.testing.assert_array_equal(asked.values[:3], left_over[:3])
+    requested = conditioning(RunningChunk(left_over, 3, mode="rtc_trained"))
+    assert requested.guidance is None and requested.held is not None and requested.values is not None
+    np.testing.assert_array_equal(requested.held, np.arange(H) < 3)
+    np.testing.assert_array_equal(requested.values[:3], left_over[:3])
     assert conditioning(RunningChunk(left_over, 0, mode="rtc_trained")).form == "plain"
 
 
@@ -212,13 +212,13 @@ def test_a_plain_call_keeps_its_bits_beside_joined_ones(policy: UnifiedPolicy) -
 
 
 def test_token_times_bring_their_number_of_steps(policy: UnifiedPolicy) -> None:
-    observation, asked = policy.example_observation(), Conditioning(TokenTimes.plain(5, H))
+    observation, requested = policy.example_observation(), Conditioning(TokenTimes.plain(5, H))
     expected = policy.infer(observation, seed=0, num_steps=5)["actions"]
-    np.testing.assert_array_equal(policy.infer(observation, seed=0, conditioning=asked)["actions"], expected)
+    np.testing.assert_array_equal(policy.infer(observation, seed=0, conditioning=requested)["actions"], expected)
     with pytest.raises(ObservationError, match="token times"):
-        policy.infer(observation, conditioning=asked, num_steps=4)
+        policy.infer(observation, conditioning=requested, num_steps=4)
     with pytest.raises(ObservationError, match="both given"):
-        policy.infer(observation, conditioning=asked, previous=RunningChunk(rows(8), 2))
+        policy.infer(observation, conditioning=requested, previous=RunningChunk(rows(8), 2))
 
 
 def test_metadata_says_what_can_be_joined(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,23 +240,23 @@ def test_a_backend_that_cannot_says_which_can(policy: UnifiedPolicy, monkeypatch
     monkeypatch.setattr(type(policy.backend), "forms", ())
     with pytest.raises(ObservationError, match="held actions or guidance by token"):
         policy.infer(observation, conditioning=Conditioning(held=np.ones(H, bool), values=rows(H)))
-    asked = Conditioning(TokenTimes.plain(2, H))
+    requested = Conditioning(TokenTimes.plain(2, H))
     with pytest.raises(ConfigError, match="warm-up: backend 'pytorch' has no times"):
-        policy.warmup(conditioning=[asked])
+        policy.warmup(conditioning=[requested])
 
 
 def test_warm_up_takes_modes_and_examples(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-    monkeypatch.setattr(policy.backend, "warmup", lambda *args, **options: asked.append((args[1:], options)))
+    requested: list[Any] = []
+    monkeypatch.setattr(policy.backend, "warmup", lambda *args, **options: requested.append((args[1:], options)))
     own = Conditioning(TokenTimes.plain(7, H))
     policy.warmup(cameras=2, steps=[2, 3], real_time=["rtc", "rtc_trained"], conditioning=[own])
-    loops = [(loop, options.get("conditioning")) for loop, options in asked]
+    loops = [(loop, options.get("conditioning")) for loop, options in requested]
     forms = [(loop, None if one is None else one.form) for loop, one in loops]
     assert forms == [
         *(((2, H), None), ((3, H), None), ((2, H), "jacobian"), ((3, H), "jacobian")),
         *(((2, H), "tokens"), ((3, H), "tokens"), ((7, H), "tokens")),
     ]
-    assert [options["last"] for _, options in asked] == [False] * 6 + [True]
+    assert [options["last"] for _, options in requested] == [False] * 6 + [True]
 
 
 # -- relative actions --------------------------------------------------------------------------------------------------
@@ -336,10 +336,10 @@ def test_guidance_of_an_unused_dimension_is_the_left_overs_own(policy: UnifiedPo
     """Dimensions past the robot's are the model's, too: they are returned, and pulled to what they were."""
     first = policy.infer(policy.example_observation(), seed=0, model_actions=True)["model_actions"]
     assert np.abs(first[:, 7:]).max() > 0
-    asked = conditioning(RunningChunk(first[2:], 1))
-    assert isinstance(asked.guidance, Guidance)
-    np.testing.assert_array_equal(asked.guidance.target[: H - 2, 7:], first[2:, 7:])
-    assert torch.from_numpy(asked.guidance.target[H - 2 :]).abs().max() == 0
+    requested = conditioning(RunningChunk(first[2:], 1))
+    assert isinstance(requested.guidance, Guidance)
+    np.testing.assert_array_equal(requested.guidance.target[: H - 2, 7:], first[2:, 7:])
+    assert torch.from_numpy(requested.guidance.target[H - 2 :]).abs().max() == 0
 
 
 # -- batches -----------------------------------------------------------------------------------------------------------
@@ -364,13 +364,13 @@ CHUNKS = [
 def test_a_batch_joins_a_chunk_in_each_row_as_infer_does(which: str, request: pytest.FixtureRequest) -> None:
     policy: UnifiedPolicy = request.getfixturevalue(which)
     seen = [policy.example_observation(seed) for seed in range(5)]
-    told = [True, False, True, False, True]
-    together = policy.infer_batch(seen, seed=[4, 5, 6, 7, 8], previous=CHUNKS, model_actions=told)
+    reported = [True, False, True, False, True]
+    together = policy.infer_batch(seen, seed=[4, 5, 6, 7, 8], previous=CHUNKS, model_actions=reported)
     for i, (one, obs, chunk) in enumerate(zip(together, seen, CHUNKS, strict=True)):
         alone = policy.infer(obs, seed=4 + i, previous=chunk, model_actions=True)
         np.testing.assert_allclose(one["actions"], alone["actions"], atol=1e-4)
-        assert ("model_actions" in one) == told[i]
-        if told[i]:
+        assert ("model_actions" in one) == reported[i]
+        if reported[i]:
             np.testing.assert_allclose(one["model_actions"], alone["model_actions"], atol=1e-4)
     np.testing.assert_array_equal(together[2]["model_actions"][:3], CHUNKS[2].left_over[:3])  # type: ignore[union-attr]
     plain = policy.infer_batch(seen, seed=4)
@@ -385,8 +385,8 @@ def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy
     """Times of its own bring the number of steps, for all rows."""
     seen = [engine.example_observation(seed) for seed in range(3)]
     warm = Conditioning(tokens=TokenTimes.of(np.linspace(0.5, 0, 4)[:, None].repeat(H, 1)))
-    told: list[Conditioning | None] = [None, warm, None]
-    together = engine.infer_batch(seen, seed=1, conditioning=told, previous=[CHUNKS[0], None, None])
+    reported: list[Conditioning | None] = [None, warm, None]
+    together = engine.infer_batch(seen, seed=1, conditioning=reported, previous=[CHUNKS[0], None, None])
     alone = [
         engine.infer(seen[0], seed=1, previous=CHUNKS[0], num_steps=3),
         engine.infer(seen[1], seed=2, conditioning=warm),
@@ -454,13 +454,13 @@ def test_what_a_row_cannot_join_is_refused_with_its_number(
 
 
 def test_warm_up_captures_batches_of_each_mode(engine: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Any, ...]] = []
+    requested: list[tuple[Any, ...]] = []
     monkeypatch.setattr(engine.backend, "warmup", lambda *_, **__: None)
-    monkeypatch.setattr(engine.backend, "warmup_batches", lambda _, *rest: asked.append(rest))
+    monkeypatch.setattr(engine.backend, "warmup_batches", lambda _, *rest: requested.append(rest))
     engine.warmup(cameras=2, batches=[1, 4], real_time=["rtc", "rtc_trained"])
-    forms = [None if one is None else one.form for *_, one in asked]
-    assert forms == [None, "jacobian", "tokens"] and {rest[:2] for rest in asked} == {(2, H)}
-    assert all(rest[2] == [1, 4] for rest in asked)
+    forms = [None if one is None else one.form for *_, one in requested]
+    assert forms == [None, "jacobian", "tokens"] and {rest[:2] for rest in requested} == {(2, H)}
+    assert all(rest[2] == [1, 4] for rest in requested)
     assert engine.batch_modes == ("rtc", "rtc_identity", "rtc_trained")
 
 

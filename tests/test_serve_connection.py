@@ -238,7 +238,7 @@ def test_a_frame_that_is_wrong_is_refused_as_ever() -> None:
     run(test, message_bytes=100)
 
 
-def pictures(seed: int, size: int = 300_000) -> bytes:
+def camera_images(seed: int, size: int = 300_000) -> bytes:
     return random.Random(seed).randbytes(size)
 
 
@@ -261,7 +261,7 @@ def test_two_clients_pictures_that_come_at_once_stay_apart(whole: bool) -> None:
     async def test(server: Server) -> None:
         clients = [await server.client() for _ in range(3)]
         for round_ in range(3):
-            messages = [pictures(10 * round_ + i, 300_000 - 1000 * (i + round_)) for i in range(len(clients))]
+            messages = [camera_images(10 * round_ + i, 300_000 - 1000 * (i + round_)) for i in range(len(clients))]
             frames = [frame(message, mask=b"\x80abc") for message in messages]
             for begin in range(0, 301_000, 70_000):
                 for client, data in zip(clients, frames, strict=True):
@@ -315,7 +315,7 @@ def test_a_large_frame_that_is_wrong_is_refused_as_ever(data: bytes, code: int |
 def test_pictures_that_are_half_there_when_the_server_closes_end_in_order(whole: bool) -> None:
     async def test(server: Server) -> None:
         client = await server.client()
-        data = frame(pictures(0), mask=b"\xff\xfe\xfd\xfc")
+        data = frame(camera_images(0), mask=b"\xff\xfe\xfd\xfc")
         client.send(data[:200_000], whole=whole)
         closing = asyncio.create_task(client.connection.close(1001, "the server is shutting down"))
         await asyncio.sleep(0)

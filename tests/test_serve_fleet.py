@@ -18,7 +18,7 @@ from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, observation
 from websockets.sync.client import connect
 
-from turbopi.cli.fleet_update import Asked
+from turbopi.cli.fleet_update import Requested
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.serve_ray import FleetWishes, check_fits, check_runs
 from turbopi.realtime.client import RealTimeClient, ServerRefused
@@ -128,11 +128,11 @@ class SecondTimeWell(RemoteCalls):
 
     def __init__(self, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
         super().__init__(None, metrics, 60.0, on_lost=on_lost)
-        self.asked = 0
+        self.requested = 0
 
     async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Result:
-        self.asked += 1
-        if self.asked == 1:
+        self.requested += 1
+        if self.requested == 1:
             return Result(0.0, error="replica", text="its process ended during this request; ask again")
         return Result(0.0, answer={"actions": np.zeros((2, 8))})
 
@@ -257,11 +257,11 @@ def test_weights_with_other_chunks_or_for_another_robot_are_no_update() -> None:
     ],
 )
 def test_all_gpus_are_not_one_by_number_and_not_cpus(device: str, words: str) -> None:
-    asked = Asked(PolicyOptions(random_weights="pi05_tiny", device=device), ServerOptions(), True, False)
+    requested = Requested(PolicyOptions(random_weights="pi05_tiny", device=device), ServerOptions(), True, False)
     wishes = FleetWishes(True, None, "all", None, None, False)
     with pytest.raises(ConfigError, match=re.escape(words)):
-        wishes.options(asked, None)
-    assert wishes.options(replace(asked, policy=replace(asked.policy, device="cuda")), None).use_gpus
+        wishes.options(requested, None)
+    assert wishes.options(replace(requested, policy=replace(requested.policy, device="cuda")), None).use_gpus
 
 
 def test_the_help_shows_a_fleet() -> None:

@@ -207,14 +207,14 @@ def test_a_robot_that_asks_again_at_once_stays_at_its_replica(fleet: FleetProces
 
     with fleet.robot() as robot:
 
-        def asked_often() -> bool:
-            asked = [(time.monotonic(), robot.actions()["pid"], time.monotonic()) for _ in range(41)]
-            for (sent, before, _), (_, after, answered) in itertools.pairwise(asked):
+        def requested_often() -> bool:
+            requested = [(time.monotonic(), robot.actions()["pid"], time.monotonic()) for _ in range(41)]
+            for (sent, before, _), (_, after, answered) in itertools.pairwise(requested):
                 if answered - sent < SOON_SECONDS:  # so the answer before it was younger still
                     moves.append(before != after)
             return len(moves) >= 40
 
-        wait_for(asked_often)
+        wait_for(requested_often)
         assert sum(moves) < len(moves) / 4, f"{sum(moves)} of {len(moves)}: at random it would be half"
         assert len(processes(robot)) == 2, "one that takes its time goes to either"
 

@@ -43,11 +43,11 @@ class Cluster:
     """What a watch asks: each question is noted."""
 
     def __init__(self) -> None:
-        self.reachable, self.asked, self.unwell = False, threading.Event(), threading.Event()
+        self.reachable, self.requested, self.unwell = False, threading.Event(), threading.Event()
         self.why: str | Exception | None = None
 
     def answers(self) -> bool:
-        self.asked.set()
+        self.requested.set()
         return self.reachable
 
     def why_unwell(self) -> str | None:
@@ -59,24 +59,24 @@ class Cluster:
 
 def watching(ray: socket.socket, cluster: Cluster) -> tuple[Watch, threading.Event, list[str]]:
     reasons: list[str] = []
-    gone = threading.Event()
+    ended = threading.Event()
     watch = Watch(at(ray), cluster.answers, cluster.why_unwell)
 
-    def on_gone(reason: str) -> None:
+    def when_lost(reason: str) -> None:
         reasons.append(reason)
-        gone.set()
+        ended.set()
 
-    watch.start(on_gone)
-    return watch, gone, reasons
+    watch.start(when_lost)
+    return watch, ended, reasons
 
 
 def test_ray_that_has_ended_is_told_once(ray: socket.socket) -> None:
     address, cluster = at(ray), Cluster()
     assert answers(address)
-    watch, gone, reasons = watching(ray, cluster)
-    assert not cluster.asked.wait(0.2) and not gone.is_set(), "as long as Ray is there, no replica is asked"
+    watch, ended, reasons = watching(ray, cluster)
+    assert not cluster.requested.wait(0.2) and not ended.is_set(), "as long as Ray is there, no replica is asked"
     ray.close()
-    assert gone.wait(MOST_SECONDS)
+    assert ended.wait(MOST_SECONDS)
     watch.stop()
     assert reasons == [f"Ray's cluster at {address} has ended, and all replicas with it. Start this server again"]
 
@@ -84,9 +84,9 @@ def test_ray_that_has_ended_is_told_once(ray: socket.socket) -> None:
 def test_replicas_that_answer_go_on_without_rays_control_service(ray: socket.socket) -> None:
     cluster = Cluster()
     cluster.reachable = True
-    watch, gone, _ = watching(ray, cluster)
+    watch, ended, _ = watching(ray, cluster)
     ray.close()
-    assert cluster.asked.wait(MOST_SECONDS) and not gone.wait(0.2)
+    assert cluster.requested.wait(MOST_SECONDS) and not ended.wait(0.2)
     watch.stop()
 
 

@@ -53,11 +53,11 @@ class Together(HoldingJoins):
         model_actions: Sequence[bool] = (),
     ) -> list[dict[str, Any]]:
         count = len(observations)
-        chunks, told = previous or [None] * count, model_actions or [False] * count
+        chunks, reported = previous or [None] * count, model_actions or [False] * count
         self.batches.append([None if one is None else one.mode for one in chunks])
         if self.fault is not None:
             raise self.fault("a batch")
-        rows = zip(observations, chunks, told, strict=True)
+        rows = zip(observations, chunks, reported, strict=True)
         return [self.infer(obs, previous=chunk, model_actions=wants) for obs, chunk, wants in rows]
 
 

@@ -102,9 +102,13 @@ def test_bad_requests_fill_no_log(caplog: pytest.LogCaptureFixture) -> None:
         served(test, limits=Limits(work_rate=1e6))
     about = [record for record in caplog.records if "0xc1" in record.getMessage()]
     assert 1 <= len(about) <= 50
-    told = sum(int(record.getMessage().split()[0]) for record in caplog.records if "left out (m" in record.getMessage())
-    told += sum(int(record.getMessage().rpartition("(")[2].split()[0]) for record in about if " left " in record.msg)
-    assert len(about) + told == 100
+    reported = sum(
+        int(record.getMessage().split()[0]) for record in caplog.records if "left out (m" in record.getMessage()
+    )
+    reported += sum(
+        int(record.getMessage().rpartition("(")[2].split()[0]) for record in about if " left " in record.msg
+    )
+    assert len(about) + reported == 100
 
 
 # --- clients that don't end what they begin, or don't read ------------------------------------------------------------
@@ -306,8 +310,8 @@ def test_a_client_that_left_before_it_was_taken_ends_no_accepting(monkeypatch: p
             return await take(make, sock)
 
         monkeypatch.setattr(loop, "connect_accepted_socket", connect_accepted_socket)
-        async with raw(server, b"") as gone, client(server) as good:
-            assert await gone.ended() == b""
+        async with raw(server, b"") as lost, client(server) as good:
+            assert await lost.ended() == b""
             await infer(good, observation())
 
     served(test)

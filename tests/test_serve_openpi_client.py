@@ -151,5 +151,5 @@ def test_openpi_client_gets_joined_chunks_and_an_executor_without_pytorch() -> N
     assert "turbopi/step is 1, after 3" in seen["refused"]
     assert seen["places"] == [float(i) for i in range(30)]
     assert seen["torch"] is False
-    told = [previous for previous in policy.calls[5:] if previous is not None]
-    assert told and all(previous.mode == "rtc" for previous in told)
+    reported = [previous for previous in policy.calls[5:] if previous is not None]
+    assert reported and all(previous.mode == "rtc" for previous in reported)

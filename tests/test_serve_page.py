@@ -131,7 +131,7 @@ def test_the_page_names_no_other_place_and_makes_no_markup_of_text() -> None:
 
 
 @pytest.mark.parametrize(
-    ("host", "key", "asked", "shown"),
+    ("host", "key", "requested", "shown"),
     [
         ("127.0.0.1", None, None, True),
         ("localhost", None, None, True),
@@ -143,9 +143,9 @@ def test_the_page_names_no_other_place_and_makes_no_markup_of_text() -> None:
     ],
 )
 def test_the_page_is_on_where_only_this_machine_or_the_keys_holder_sees_it(
-    host: str, key: str | None, asked: bool | None, shown: bool
+    host: str, key: str | None, requested: bool | None, shown: bool
 ) -> None:
-    assert ServerOptions(host=host, api_key=key, page=asked).has_page is shown
+    assert ServerOptions(host=host, api_key=key, page=requested).has_page is shown
 
 
 def test_without_a_page_robots_are_served_and_browsers_are_told() -> None:
@@ -246,8 +246,8 @@ def test_a_watcher_has_nothing_to_say() -> None:
 
 
 def test_the_feed_tells_the_policy_then_what_robots_did() -> None:
-    picture = np.zeros((60, 480, 3), np.uint8)
-    picture[:, :240] = (250, 10, 10)
+    camera_image = np.zeros((60, 480, 3), np.uint8)
+    camera_image[:, :240] = (250, 10, 10)
 
     async def test(server: PolicyServer) -> None:
         async with connect(live_url(server)) as watcher, robot(server) as connection:
@@ -255,7 +255,7 @@ def test_the_feed_tells_the_policy_then_what_robots_did() -> None:
             assert isinstance(hello, Hello)
             assert hello.policy == {**Robotic().metadata, "numpy": 2.0}
             assert [group.title for group in hello.actions] == ["translation", "rotation", "gripper"]
-            shown = await seen(watcher, connection, "put <b>it</b> down", **{"observation/image": picture})
+            shown = await seen(watcher, connection, "put <b>it</b> down", **{"observation/image": camera_image})
             assert shown.actions == np.linspace(-1, 1, 14).reshape(2, 7).tolist()
             assert shown.numbers == {"observation/state": observation()["observation/state"].tolist()}
             assert shown.timing["infer"] == 3.0 and (shown.timing["request"] or 0) > 0
@@ -323,8 +323,8 @@ def test_no_preview_is_made_while_no_page_is_open(monkeypatch: pytest.MonkeyPatc
                 assert isinstance(await ask(connection), dict)
             assert previewed == []
             async with connect(live_url(server)) as watcher:
-                told = await frame(watcher)
-                assert told.robots[0].calls == 5 and told.latency[0].calls == 5  # what costs nothing is known
+                reported = await frame(watcher)
+                assert reported.robots[0].calls == 5 and reported.latency[0].calls == 5  # what costs nothing is known
                 while not previewed:
                     await ask(connection)
 
@@ -431,7 +431,7 @@ def test_stages_are_counted_in_shared_bins_and_the_slowest_call_is_in_the_last()
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "image",
     [
         np.full((8, 8, 3), 0.5),
         np.full((8, 8, 3), np.nan, np.float32),
@@ -440,9 +440,9 @@ def test_stages_are_counted_in_shared_bins_and_the_slowest_call_is_in_the_last()
     ],
     ids=["float64", "nan", "a line", "backwards"],
 )
-def test_any_picture_becomes_a_small_jpeg(picture: np.ndarray) -> None:
-    made = thumbnail(picture)
-    assert (made.height, made.width) == picture.shape[:2]
+def test_any_picture_becomes_a_small_jpeg(camera_image: np.ndarray) -> None:
+    made = thumbnail(camera_image)
+    assert (made.height, made.width) == camera_image.shape[:2]
     with Image.open(io.BytesIO(made.jpeg)) as small:
         assert max(small.size) <= THUMBNAIL
 
@@ -481,12 +481,12 @@ def test_memory_is_the_processs_or_what_pytorch_holds_of_the_gpu(monkeypatch: py
     properties = type("Properties", (), {"total_memory": 80})
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: {"cuda:1": 7}[device])
-    told = memory_of("cuda:1")()
-    assert (told.used, told.total) == (7, 80) and "GPU" in told.what
+    reported = memory_of("cuda:1")()
+    assert (reported.used, reported.total) == (7, 80) and "GPU" in reported.what
 
 
 def test_metadata_that_is_no_json_is_told_as_far_as_it_goes() -> None:
-    told = Live(Metrics(), Worker(Schedule(1)), lambda: None)
-    told.start({"a": np.arange(2), "b": Path("/x"), ("no", "key"): 1, "robot": 3}, queue_limit=16)  # type: ignore[dict-item]
-    hello = FEED.decode(told._hello)
+    reported = Live(Metrics(), Worker(Schedule(1)), lambda: None)
+    reported.start({"a": np.arange(2), "b": Path("/x"), ("no", "key"): 1, "robot": 3}, queue_limit=16)  # type: ignore[dict-item]
+    hello = FEED.decode(reported._hello)
     assert isinstance(hello, Hello) and hello.policy == {"a": [0, 1], "b": "/x", "robot": 3} and hello.actions == []

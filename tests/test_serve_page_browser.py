@@ -22,7 +22,7 @@ HOSTILE = "</script><img src=x onerror=\"document.title='owned'\"><b>bowl</b>"
 ACTIONS = np.stack([np.linspace(-1, 1, 5), *(np.full(5, value) for value in (0, 0.5, 0, 0, 0, -1))], axis=1)
 
 
-# of the picture's middle
+# of the image's middle
 COLOUR = """(async () => {
     const image = document.querySelector('.robot img[alt="front"]'), canvas = new OffscreenCanvas(9, 9);
     const context = canvas.getContext("2d");
@@ -62,8 +62,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 def robot(server: PolicyServer, prompt: str, *, key: str = "") -> Iterator[None]:
     """A robot that asks on and on."""
     done, failed = threading.Event(), list[BaseException]()
-    picture = np.zeros((32, 64, 3), np.uint8)
-    picture[..., 0] = 200
+    camera_image = np.zeros((32, 64, 3), np.uint8)
+    camera_image[..., 0] = 200
 
     def run() -> None:
         try:
@@ -71,7 +71,7 @@ def robot(server: PolicyServer, prompt: str, *, key: str = "") -> Iterator[None]
             with connect(server.url, compression=None, additional_headers=headers) as connection:
                 connection.recv()
                 for number in itertools.count():
-                    connection.send(pack(observation(prompt) | {"front": picture}))
+                    connection.send(pack(observation(prompt) | {"front": camera_image}))
                     assert isinstance(connection.recv(), bytes)
                     if number == 3:
                         connection.send(pack(observation("wrong")))
@@ -112,7 +112,7 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
         assert HOSTILE in text(page, "#policy") and HOSTILE in text(page, "#troubles")
         assert page.value("document.title") == "Turbo-Pi: pi05_libero"
         assert page.value("document.querySelectorAll('.prompt *, #policy dd *, #troubles img').length") == 0
-        # its picture, in its colour
+        # its image, in its colour
         red, green, _ = page.value(COLOUR)
         assert abs(red - 200) < 8 and green < 8
         assert "front\n64 × 32" in text(page, ".images")

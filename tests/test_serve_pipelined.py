@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from policy_helpers import policy_on
 from serve_fakes import PipelinedFakePolicy, observation
-from tensorrt_fakes import on_twins
+from tensorrt_fakes import on_references
 from test_serve_server import client, eventually, infer, metric, refused, stop_while_the_client_has_left
 from websockets.exceptions import ConnectionClosed
 
@@ -139,7 +139,7 @@ def test_an_answer_that_never_comes_holds_no_stop(monkeypatch: pytest.MonkeyPatc
 def test_a_pipelined_backends_served_actions_are_its_own(tmp_path: Path) -> None:
     """The real backend on its engines' twins, under three robots at once."""
     policy: Any = policy_on(
-        on_twins(TensorRTPipelinedBackend, tmp_path), random_checkpoint("pi05_tiny"), num_denoising_steps=2
+        on_references(TensorRTPipelinedBackend, tmp_path), random_checkpoint("pi05_tiny"), num_denoising_steps=2
     )
     assert policy.pipelined
     steady = policy._noise

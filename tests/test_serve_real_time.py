@@ -103,17 +103,21 @@ def call(
 
 def test_a_running_chunk_comes_through_a_message_as_it_was() -> None:
     sent = RunningChunk(np.ones((4, A), np.float32), 2, 5, "rtc_identity", np.arange(3.0), "linear", 7.0)
-    observation, asked = read_message(unpack(pack(message({"a": 1}, sent, True))))
-    got = asked.previous
-    assert observation == {"a": 1} and asked.model_actions and got is not None and got.anchor is not None
+    observation, requested = read_message(unpack(pack(message({"a": 1}, sent, True))))
+    got = requested.previous
+    assert observation == {"a": 1} and requested.model_actions and got is not None and got.anchor is not None
     np.testing.assert_array_equal(got.left_over, sent.left_over)
     np.testing.assert_array_equal(got.anchor, np.arange(3.0))
     assert (got.delay, got.execution_horizon, got.mode, got.schedule, got.max_guidance_weight) == (
         *(2, 5, "rtc_identity", "linear", 7.0),
     )
     bare = RunningChunk(np.ones((4, A), np.float32), 0)
-    _, asked = read_message(unpack(pack(message({}, bare))))
-    assert asked.previous is not None and asked.previous.schedule is None and asked.previous.execution_horizon is None
+    _, requested = read_message(unpack(pack(message({}, bare))))
+    assert (
+        requested.previous is not None
+        and requested.previous.schedule is None
+        and requested.previous.execution_horizon is None
+    )
     assert read_message({"a": 1})[1].previous is None
 
 
@@ -123,7 +127,7 @@ LARGE[2, 1] = 1
 
 
 @pytest.mark.parametrize(
-    ("asked", "text"),
+    ("requested", "text"),
     [
         ({"speed": 1}, "turbopi/speed is no key of this server"),
         ({"mode": "fast"}, "turbopi/mode is 'fast'; it should be one of rtc, rtc_identity, rtc_trained"),
@@ -162,9 +166,9 @@ LARGE[2, 1] = 1
         ({"anchor": np.zeros(2)}, "turbopi/anchor came without turbopi/previous"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_by_name_and_value(asked: dict[str, Any], text: str) -> None:
+def test_what_cannot_be_meant_is_refused_by_name_and_value(requested: dict[str, Any], text: str) -> None:
     with pytest.raises(ObservationError, match=text):
-        read_message({"place": 0, **{f"turbopi/{key}": value for key, value in asked.items()}})
+        read_message({"place": 0, **{f"turbopi/{key}": value for key, value in requested.items()}})
 
 
 # --- a client that keeps its chunk ------------------------------------------------------------------------------------
@@ -191,14 +195,14 @@ def test_a_client_that_keeps_its_chunk_gets_model_actions_and_the_anchor() -> No
     policy.anchor = True
     first = call(server, policy, message({"place": 0}, None, True))
     assert first["real_time"] == {"joined": False}
-    told = RunningChunk(first["model_actions"][4:], 2, 4, "rtc", first["anchor"])
-    answer = call(server, policy, message({"place": 4}, told, True))
+    reported = RunningChunk(first["model_actions"][4:], 2, 4, "rtc", first["anchor"])
+    answer = call(server, policy, message({"place": 4}, reported, True))
     assert answer["real_time"] == {"joined": True, "mode": "rtc", "delay": 2}
     np.testing.assert_array_equal(answer["anchor"], [1.5, 4.0])
     got = policy.calls[1]
     assert got is not None and got.anchor is not None
-    np.testing.assert_array_equal(got.left_over, told.left_over)
-    assert "model_actions" not in call(server, policy, message({"place": 4}, told))
+    np.testing.assert_array_equal(got.left_over, reported.left_over)
+    assert "model_actions" not in call(server, policy, message({"place": 4}, reported))
     assert policy.seen[1] == {"place"}
 
 
@@ -230,9 +234,9 @@ def test_a_plain_client_gets_joined_chunks_by_the_servers_clock() -> None:
     assert "model_actions" not in first and first["real_time"] == {"joined": False, "mode": "rtc"}
     clock.now += 0.07  # 0.1 s since the first observation came: 5 actions
     second = call(server, policy, {"place": 5}, seconds=0.05)
-    told = policy.calls[1]
-    assert told is not None and (told.delay, told.execution_horizon, told.mode) == (2, 5, "rtc")
-    np.testing.assert_array_equal(told.left_over[:, 0], np.arange(5, 10))
+    reported = policy.calls[1]
+    assert reported is not None and (reported.delay, reported.execution_horizon, reported.mode) == (2, 5, "rtc")
+    np.testing.assert_array_equal(reported.left_over[:, 0], np.arange(5, 10))
     about = {"joined": True, "mode": "rtc", "row": 5, "row_by": "clock", "delay": 2, "execution_horizon": 5}
     assert second["real_time"] == {**about, "delay_cut": False}
     clock.now += 10
@@ -250,8 +254,8 @@ def test_a_client_that_counts_its_actions_is_exact_whatever_the_clock_says() -> 
     call(server, policy, {"place": 0, "turbopi/step": 100})
     clock.now += 3600
     answer = call(server, policy, {"place": 6, "turbopi/step": 106, "turbopi/delay": 3})
-    told = policy.calls[1]
-    assert told is not None and told.delay == 3 and told.left_over[0, 0] == 6
+    reported = policy.calls[1]
+    assert reported is not None and reported.delay == 3 and reported.left_over[0, 0] == 6
     assert answer["real_time"]["row_by"] == "step" and answer["real_time"]["row"] == 6
 
 
@@ -280,16 +284,16 @@ def test_every_connection_is_a_session_and_a_name_outlives_its_connection() -> N
 
 def test_a_client_may_ask_for_a_session_where_the_server_was_not_started_for_it() -> None:
     server, policy, _, _ = real_time()
-    asked = {
+    requested = {
         "turbopi/session": "arm",
         "turbopi/mode": "rtc_identity",
         "turbopi/delay": 1,
         "turbopi/model_actions": True,
     }
-    call(server, policy, {"place": 0, "turbopi/step": 0, **asked})
-    answer = call(server, policy, {"place": 3, "turbopi/step": 3, **asked})
-    told = policy.calls[1]
-    assert told is not None and told.mode == "rtc_identity" and "model_actions" in answer
+    call(server, policy, {"place": 0, "turbopi/step": 0, **requested})
+    answer = call(server, policy, {"place": 3, "turbopi/step": 3, **requested})
+    reported = policy.calls[1]
+    assert reported is not None and reported.mode == "rtc_identity" and "model_actions" in answer
 
 
 def test_sessions_are_bounded_and_dropped_by_a_rule(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,10 +326,10 @@ def test_requests_without_actions_end_no_session_and_leave_none() -> None:
         call(server, policy, {"place": 0, "turbopi/session": "arm", "turbopi/step": step}, "robot")
         for number in range(2 * sessions_module.MAX_SESSIONS):
             more = {} if number % 2 else {"turbopi/reset": True}
-            asked = {"place": 0, "turbopi/session": f"x{number}", "turbopi/step": 1, **more}
-            server.release(server.plan(asked, "other"))  # refused: busy, late, …
+            requested = {"place": 0, "turbopi/session": f"x{number}", "turbopi/step": 1, **more}
+            server.release(server.plan(requested, "other"))  # refused: busy, late, …
             with pytest.raises(ObservationError):  # refused at once
-                server.plan({**asked, "turbopi/execution_horizon": H + 1, "turbopi/mode": "fast"}, "other")
+                server.plan({**requested, "turbopi/execution_horizon": H + 1, "turbopi/mode": "fast"}, "other")
         assert len(server._named) == 1
     assert policy.calls[-1] is not None and "turbopi_real_time_sessions 1.0" in metrics.text()
 
@@ -350,15 +354,15 @@ def test_a_refused_newer_request_leaves_the_waiting_one_the_sessions() -> None:
     waiting = True
     server, policy, _, _ = real_time(execution="rtc", control_hz=50)
     server._waits = lambda name: waiting
-    asked = {"place": 0, "turbopi/session": "arm", "turbopi/step": 1}
-    first = server.plan(asked, "robot")
-    server.release(server.plan(asked, "other"))  # late itself: the first one still waits
+    requested = {"place": 0, "turbopi/session": "arm", "turbopi/step": 1}
+    first = server.plan(requested, "robot")
+    server.release(server.plan(requested, "other"))  # late itself: the first one still waits
     waiting = False  # it runs
     with pytest.raises(ObservationError, match="isn't answered yet"):
-        server.plan(asked, "other")
+        server.plan(requested, "other")
     server.finish(first, policy.infer(first.observation, **first.arguments))
     server.release(first)
-    call(server, policy, {**asked, "turbopi/step": 2})
+    call(server, policy, {**requested, "turbopi/step": 2})
     assert policy.calls[-1] is not None
 
 
@@ -368,8 +372,8 @@ def test_a_request_without_actions_leaves_the_sessions_chunk_as_it_is() -> None:
     with pytest.raises(ActionError):
         call(server, policy, {"place": 2, "turbopi/step": 2, "bad": True})
     call(server, policy, {"place": 4, "turbopi/step": 4})
-    told = policy.calls[-1]
-    assert told is not None and told.left_over[0, 0] == 4
+    reported = policy.calls[-1]
+    assert reported is not None and reported.left_over[0, 0] == 4
 
 
 def test_a_measured_delay_that_does_not_fit_is_cut_and_said() -> None:
@@ -467,9 +471,13 @@ def served() -> Iterator[tuple[PolicyServer, Joins]]:
 def test_the_greeting_says_what_a_server_offers(served: tuple[PolicyServer, Joins]) -> None:
     server, policy = served
     with RealTimeClient("127.0.0.1", server.port) as client:
-        told = client.metadata["real_time"]
-    assert told["modes"] == REAL_TIME["modes"] and told["trained_max_delay"] == 2 and told["execution"] == "rtc"
-    assert told["keys"] == [f"turbopi/{key}" for key in KEYS] and told["sessions"]["most"] == 256
+        reported = client.metadata["real_time"]
+    assert (
+        reported["modes"] == REAL_TIME["modes"]
+        and reported["trained_max_delay"] == 2
+        and reported["execution"] == "rtc"
+    )
+    assert reported["keys"] == [f"turbopi/{key}" for key in KEYS] and reported["sessions"]["most"] == 256
     assert policy.warm == [{"real_time": "rtc"}]
 
 
@@ -486,10 +494,10 @@ def test_the_server_survives_every_refusal(served: tuple[PolicyServer, Joins]) -
         socket.recv()
         socket.send(pack({"place": 0, "turbopi/step": 2}))
         assert isinstance(socket.recv(30), bytes)
-        for asked in bad:
-            socket.send(pack({"place": 0, **asked}))
+        for requested in bad:
+            socket.send(pack({"place": 0, **requested}))
             reply = socket.recv(30)
-            assert isinstance(reply, str) and reply.startswith("bad observation: "), asked
+            assert isinstance(reply, str) and reply.startswith("bad observation: "), requested
         socket.send(pack({"place": 3, "turbopi/step": 3}))
         reply = socket.recv(30)
         assert isinstance(reply, bytes) and unpack(reply)["real_time"]["joined"]
@@ -511,11 +519,11 @@ def test_actions_that_are_not_finite_are_told_with_the_left_over_that_was_joined
     joined = {"turbopi/previous": LARGE * 1e18, "turbopi/mode": "rtc", "turbopi/delay": 1}
     with connect(server.url, compression=None) as socket:
         socket.recv()
-        for asked in (joined, {}):
-            socket.send(pack({"place": 0, "bad": True, **asked}))
+        for requested in (joined, {}):
+            socket.send(pack({"place": 0, "bad": True, **requested}))
             reply = socket.recv(30)
             assert isinstance(reply, str) and reply.startswith("bad actions: the actions hold nan at [0, 0]")
-            assert ("turbopi/previous has values up to 1e+18" in reply) == bool(asked)
+            assert ("turbopi/previous has values up to 1e+18" in reply) == bool(requested)
 
 
 def test_a_recording_of_joined_calls_is_read_back(tmp_path: Path) -> None:
@@ -545,11 +553,11 @@ def test_the_client_raises_what_the_server_says() -> None:
 
 
 def test_the_client_refuses_a_mode_before_it_is_sent() -> None:
-    offers = r"doesn't offer 'rtc_trained'; it offers \['rtc'\]"
+    offered = r"doesn't offer 'rtc_trained'; it offers \['rtc'\]"
     with (
         running(Joins(["rtc"])) as server,
         RealTimeClient("127.0.0.1", server.port) as client,
-        pytest.raises(ConfigError, match=offers),
+        pytest.raises(ConfigError, match=offered),
     ):
         client.infer({"place": 0}, previous=RunningChunk(LEFT, 1, mode="rtc_trained"))
 
@@ -685,7 +693,7 @@ import resource, sys
 def faults(copies=20):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(copies):
-        blocks = [b"x" * 1_843_500 for _ in range(3)]  # copies of a message with two pictures of 640 x 480
+        blocks = [b"x" * 1_843_500 for _ in range(3)]  # copies of a message with two images of 640 x 480
         del blocks
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 

@@ -272,7 +272,7 @@ def test_an_observation_is_read_from_a_folder_of_pictures(tmp_path: Path) -> Non
         ("[]", r"observation\.json is a list; expected an object"),
         ('{"a": {"file": "none.png"}}', "'a' names the file 'none.png', which isn't in"),
         ('{"a": {"file": "../secret.npy"}}', "which isn't in"),
-        ('{"a": {"file": "text.png"}}', "is neither a readable picture nor .npy"),
+        ('{"a": {"file": "text.png"}}', "is neither a readable image nor .npy"),
         ('{"a": {"file": "text.npy"}}', "isn't a readable .npy file"),
         ('{"a": {"file": "text.png", "layout": "nchw"}}', "'a' must be"),
         ('{"a": {"file": "text.png", "size": 3}}', "'a' must be"),

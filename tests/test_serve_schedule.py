@@ -438,7 +438,7 @@ def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, l
     their deadlines; None: the default one of a second, which isn't their own.
     """
     schedule, randoms, events, order = Schedule(limit, table({1: 0.02})), Random(0), list[Any](), count()
-    asked, good, now, wake = [0] * len(robots), [0] * len(robots), 0.0, -1.0
+    wanted, good, now, wake = [0] * len(robots), [0] * len(robots), 0.0, -1.0
 
     def at(when: float, what: str, who: Any) -> None:
         heappush(events, (when, next(order), what, who))
@@ -446,7 +446,7 @@ def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, l
     def replied(one: Request, answered: bool) -> None:
         kind, number, counts = one.call
         if kind == "robot":
-            asked[number] += counts
+            wanted[number] += counts
             good[number] += counts and answered and now <= one.deadline
             at(max(now, one.arrived + 0.2 * randoms.uniform(0.7, 1.3)), "ask", (kind, number))
         else:
@@ -480,7 +480,7 @@ def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, l
         if decision.wake is not None and not now < wake <= decision.wake:
             wake = max(now, decision.wake)
             at(wake, "wake", None)
-    return min(got / ask for got, ask in zip(good, asked, strict=True))
+    return min(got / ask for got, ask in zip(good, wanted, strict=True))
 
 
 @pytest.mark.slow
@@ -698,14 +698,14 @@ def test_company_that_comes_at_once_is_waited_for_and_then_no_longer() -> None:
 def test_a_late_timer_does_not_shrink_the_batch_that_was_waited_for() -> None:
     schedule = Schedule(16, table(PAYING))
     now = cohort(schedule, apart=0.001)
-    asked = [request(now, source=robot, within=0.0245, firm=True) for robot in range(3)]
-    for one in asked:
+    sent = [request(now, source=robot, within=0.0245, firm=True) for robot in range(3)]
+    for one in sent:
         assert not schedule.add(one, now)
     wake = schedule.decide(now).wake
     assert wake is not None and now < wake
-    asked.append(request(wake, source=3))
-    assert not schedule.add(asked[-1], wake)
-    assert begin(schedule, wake + 0.9 * LATE_TIMER) == asked, "four take 22 ms, and the first three had 24.5"
+    sent.append(request(wake, source=3))
+    assert not schedule.add(sent[-1], wake)
+    assert begin(schedule, wake + 0.9 * LATE_TIMER) == sent, "four take 22 ms, and the first three had 24.5"
 
 
 def test_company_that_does_not_come_is_waited_for_a_few_gaps_alone() -> None:
@@ -941,12 +941,12 @@ def test_what_was_looked_up_before_changes_no_answer(events: list[tuple[str, int
         now += value if what == "ask" else 0.0
         log.append((what, rows, now))
         fresh = table(PAYING)
-        for told, size, at in log:
-            if told == "ran":
+        for reported, size, at in log:
+            if reported == "ran":
                 fresh.ran(size, 0.011 * size, at)
-            elif told == "measured":
+            elif reported == "measured":
                 fresh.measured(size, 0.009 * size)
-            elif told == "failed":
+            elif reported == "failed":
                 fresh.failed(size, at)
         if what == "ran":
             times.ran(rows, 0.011 * rows, now)

@@ -305,10 +305,10 @@ def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pyt
 
     with caplog.at_level(logging.INFO, "turbopi"):
         served(test)
-    told = [message for message in caplog.messages if "connected" in message]
-    assert len(told) == 2
-    assert re.fullmatch(r"127\.0\.0\.1:\d+ connected", told[0])
-    assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", told[1])
+    reported = [message for message in caplog.messages if "connected" in message]
+    assert len(reported) == 2
+    assert re.fullmatch(r"127\.0\.0\.1:\d+ connected", reported[0])
+    assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", reported[1])
 
 
 def test_the_log_says_whose_request_is_refused(caplog: pytest.LogCaptureFixture) -> None:

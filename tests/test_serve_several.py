@@ -259,8 +259,8 @@ def test_a_session_that_joins_chunks_goes_on_from_the_chunk_that_its_robot_has()
 
     async def test(server: PolicyServer, policy: HoldingJoins) -> None:
         def of(place: int, **keys: Any) -> bytes:
-            asked = {"session": "arm", "mode": "rtc", "step": place, "delay": 1} | keys
-            return pack({"place": place, **{f"turbopi/{key}": value for key, value in asked.items()}})
+            requested = {"session": "arm", "mode": "rtc", "step": place, "delay": 1} | keys
+            return pack({"place": place, **{f"turbopi/{key}": value for key, value in requested.items()}})
 
         async with client(server) as first, client(server) as second, client(server) as holder:
             await first.send(of(0))
@@ -290,20 +290,20 @@ def test_a_request_that_was_replaced_does_not_free_its_session_for_a_third() -> 
     waiting = True
     options = ServerOptions(execution="rtc", control_hz=50)
     sessions = RealTime(Joins().metadata, options, Metrics(), waits=lambda name: waiting)
-    asked = {"place": 0, "turbopi/session": "a"}
-    older, newer = sessions.plan(asked, "c"), sessions.plan(asked, "d")
+    requested = {"place": 0, "turbopi/session": "a"}
+    older, newer = sessions.plan(requested, "c"), sessions.plan(requested, "d")
     waiting = False  # the newer one runs
     sessions.release(older)
     with pytest.raises(ObservationError, match="session 'a' has a request that isn't answered yet"):
-        sessions.plan(asked, "e")
+        sessions.plan(requested, "e")
     sessions.release(newer)
-    sessions.plan(asked, "e")
+    sessions.plan(requested, "e")
 
 
 def test_a_session_may_be_for_the_order_alone_where_the_policy_joins_chunks() -> None:
     with running(Joins(), execution="rtc", control_hz=50) as server:
-        asked = server._real_time.plan({"place": 0, "turbopi/session": "a", "turbopi/mode": "none"}, "c")
-        assert asked.name == "a" and asked.arguments == {} and asked.observation == {"place": 0}
+        requested = server._real_time.plan({"place": 0, "turbopi/session": "a", "turbopi/mode": "none"}, "c")
+        assert requested.name == "a" and requested.arguments == {} and requested.observation == {"place": 0}
         for keys in ({"turbopi/mode": "none"}, {"turbopi/mode": "none", "turbopi/session": "a", "turbopi/step": 1}):
             with pytest.raises(ObservationError, match="'none' joins nothing: it needs turbopi/session"):
                 server._real_time.plan({"place": 0, **keys}, "c")

@@ -524,9 +524,9 @@ def outcome_of(read: Any, data: bytes) -> tuple[str, Any]:
 
 
 def request_of(prompt: str, number: int, **more: Any) -> bytes:
-    pictures = np.random.default_rng(number).integers(0, 256, (2, 90, 90, 3), np.uint8)
+    camera_images = np.random.default_rng(number).integers(0, 256, (2, 90, 90, 3), np.uint8)
     state = {"joints": np.linspace(number, 1, 7), "gripper": np.float32(number), "closed": np.array([True, False])}
-    return pack({"images": dict(zip("ab", pictures, strict=True)), "state": state, "prompt": prompt, **more})
+    return pack({"images": dict(zip("ab", camera_images, strict=True)), "state": state, "prompt": prompt, **more})
 
 
 def test_messages_that_differ_in_numbers_alone_are_read_without_a_walk(monkeypatch: pytest.MonkeyPatch) -> None:

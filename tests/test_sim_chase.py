@@ -86,9 +86,9 @@ def test_holding_the_target_solves_it_and_touching_the_post_never_does() -> None
 
 def test_pictures_show_where_target_and_tip_are() -> None:
     world, px = worlds(4), 64
-    for picture, target, tip in zip(world.draw(px)[:, 0], world.target, world.tip, strict=True):
+    for camera_image, target, tip in zip(world.draw(px)[:, 0], world.target, world.tip, strict=True):
         for channel, place in ((0, target), (2, tip)):
-            row, column = np.unravel_index(int(picture[..., channel].argmax()), (px, px))
+            row, column = np.unravel_index(int(camera_image[..., channel].argmax()), (px, px))
             found = np.array([(column + 0.5) / px * 2 - 1, 1 - (row + 0.5) / px * 2])
             assert np.abs(found - place).max() < RADIUS
 

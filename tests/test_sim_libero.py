@@ -49,8 +49,8 @@ def play(environment: LiberoEnvironment, initial_state: int, steps: int = 10) ->
         environment.step(action, look=number % 5 == 0)
         if number % 5 == 0:
             seen.append(environment.observation())
-    pictures = [one[key] for one in seen for key in ("observation/image", "observation/wrist_image")]
-    return pictures + [one["observation/state"] for one in seen] + [np.array(environment.domain.sim.data.qpos)]
+    camera_images = [one[key] for one in seen for key in ("observation/image", "observation/wrist_image")]
+    return camera_images + [one["observation/state"] for one in seen] + [np.array(environment.domain.sim.data.qpos)]
 
 
 def test_the_episode_starts_from_the_bundled_initial_state(environment: LiberoEnvironment) -> None:
@@ -93,20 +93,20 @@ def test_observations_equal_those_of_the_stock_environment(environment: LiberoEn
 
 def test_pictures_are_upright_and_mirrored(environment: LiberoEnvironment) -> None:
     environment.reset(0)
-    picture = environment.observation()["observation/image"]
+    camera_image = environment.observation()["observation/image"]
     sim = environment.domain.sim
     seen = {}
     for name, thing in environment.domain.objects_dict.items():
         seen[name] = sim.data.body_xpos[sim.model.body_name2id(thing.root_body)]
-    # The camera looks at the robot: world y grows to its right, in a true picture; mirrored, to the left.
+    # The camera looks at the robot: world y grows to its right, in a true image; mirrored, to the left.
     camera = sim.model.camera_name2id("agentview")
     right = sim.data.cam_xmat[camera].reshape(3, 3)[:, 0]
     plate = seen["plate_1"] - sim.data.cam_xpos[camera]
-    reddish = picture[..., 0].astype(int) - picture[..., 2] > 60  # the plate's rim
+    reddish = camera_image[..., 0].astype(int) - camera_image[..., 2] > 60  # the plate's rim
     reddish[: PX // 2] = False
     centre = np.nonzero(reddish)[1].mean() / PX - 0.5
     assert np.sign(centre) == -np.sign(plate @ right)
-    assert picture[: PX // 8].std() < picture[PX // 2 :].std()  # the wall is above, the table below
+    assert camera_image[: PX // 8].std() < camera_image[PX // 2 :].std()  # the wall is above, the table below
 
 
 def test_an_episode_is_the_same_whatever_ran_before(environment: LiberoEnvironment) -> None:
@@ -176,8 +176,8 @@ def test_the_command_runs_two_tasks_with_random_weights(tmp_path: Path) -> None:
     code = "from turbopi.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["episodes"] == 2 and told["success"]["trials"] == 2 and told["crashes"] == 0
+    reported = json.loads(done.stdout)
+    assert reported["episodes"] == 2 and reported["success"]["trials"] == 2 and reported["crashes"] == 0
     assert len(list((tmp_path / "videos").iterdir())) == 2
 
 

@@ -13,7 +13,7 @@ from turbopi.sim import SimSettings
 from turbopi.sim.chase import ChaseEnvironment
 from turbopi.verify.demo import expert_distance
 
-PICTURES = ("observation/image", "observation/wrist_image")
+IMAGES = ("observation/image", "observation/wrist_image")
 FRAMES = load_frames()
 
 
@@ -81,7 +81,7 @@ def test_on_frames_it_never_saw_it_does_what_the_expert_did(
 def test_with_another_frames_pictures_it_does_not(policy: UnifiedPolicy, observed: list[dict[str, Any]]) -> None:
     """Measured: 0.62."""
     shifted = observed[2:] + observed[:2]
-    mixed = [{**one, **{key: other[key] for key in PICTURES}} for one, other in zip(observed, shifted, strict=True)]
+    mixed = [{**one, **{key: other[key] for key in IMAGES}} for one, other in zip(observed, shifted, strict=True)]
     position, gripper = mean_distance(policy, mixed)
     assert position > 0.4
     assert gripper < 0.6

@@ -11,7 +11,7 @@ import torch
 from conftest import golden_cases, golden_model
 from test_begin import OnCpu, on_cpu
 from test_engine import made_up
-from test_fused_choice import TwinKernel, fused, kernels
+from test_fused_choice import ReferenceKernel, fused, kernels
 from torch import Tensor
 
 from turbopi.config import Kind, Solver
@@ -67,9 +67,9 @@ def test_every_solver_is_as_its_formula_says(solver: Solver) -> None:
 
     x = torch.linspace(-1, 1, 6, dtype=torch.float64).view(1, 2, 3)
     for times in (UNEVEN, tuple(0.6 * t for t in UNEVEN)):
-        asked = Integration(solver, times)
-        expected = _written_out(velocity, x, solver, asked.times)
-        torch.testing.assert_close(integrated(velocity, x, asked), expected, rtol=1e-6, atol=1e-6)
+        requested = Integration(solver, times)
+        expected = _written_out(velocity, x, solver, requested.times)
+        torch.testing.assert_close(integrated(velocity, x, requested), expected, rtol=1e-6, atol=1e-6)
 
 
 def _written_out(velocity: Velocity, x: Tensor, solver: Solver, times: tuple[float, ...]) -> Tensor:
@@ -107,9 +107,9 @@ def test_the_exponential_solver_is_exact_after_its_first_interval_for_actions_li
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_evaluations_are_counted_and_none_is_at_the_end(solver: Solver) -> None:
     for evaluations in range(1, 12):
-        asked = Integration(solver, grid_times("uniform", intervals(solver, evaluations)), evaluations)
-        assert len(asked.by_evaluation) == evaluations and min(asked.evaluated) > 0
-        assert asked.is_euler == (solver == "euler" or evaluations == 1 or (solver, evaluations) == ("heun", 2))
+        requested = Integration(solver, grid_times("uniform", intervals(solver, evaluations)), evaluations)
+        assert len(requested.by_evaluation) == evaluations and min(requested.evaluated) > 0
+        assert requested.is_euler == (solver == "euler" or evaluations == 1 or (solver, evaluations) == ("heun", 2))
     for count in range(1, 6):
         assert intervals(solver, evaluations_of(solver, count)) == count
 
@@ -159,11 +159,13 @@ def test_the_reference_does_what_its_own_velocity_says(kind: Kind, solver: Solve
         model.denoise(cache, x, 1, conditioning=Conditioning(TokenTimes(grid, -grid)), trace=trace)
         return trace["v_t"][0]
 
-    asked = Integration(solver, UNEVEN)
+    requested = Integration(solver, UNEVEN)
     trace: Trace = {}
-    found = model.denoise(cache, noise, asked.evaluations, conditioning=Conditioning(integration=asked), trace=trace)
-    torch.testing.assert_close(found, integrated(velocity, noise, asked), rtol=1e-5, atol=1e-5)
-    assert trace["v_t"].shape[0] == asked.evaluations and torch.equal(trace["actions"], found)
+    found = model.denoise(
+        cache, noise, requested.evaluations, conditioning=Conditioning(integration=requested), trace=trace
+    )
+    torch.testing.assert_close(found, integrated(velocity, noise, requested), rtol=1e-5, atol=1e-5)
+    assert trace["v_t"].shape[0] == requested.evaluations and torch.equal(trace["actions"], found)
     euler = model.denoise(cache, noise, 3, conditioning=Conditioning(integration=Integration("euler", UNEVEN)))
     assert torch.equal(found, euler) == (solver == "euler")
 
@@ -188,17 +190,17 @@ def test_eulers_steps_on_a_grid_hold_actions_and_other_solvers_refuse_to() -> No
     found = model.denoise(cache, noise, 3, conditioning=as_grid)
     assert torch.equal(found, model.denoise(cache, noise, 3, conditioning=as_tokens))
     pull = Guidance(values, np.ones(10, np.float32), np.ones((3, 10), np.float32), "identity")
-    asked = Integration("ab2", UNEVEN)
+    requested = Integration("ab2", UNEVEN)
     for what, one in (
-        ("held actions", Conditioning(held=held, values=values, integration=asked)),
-        ("guidance", Conditioning(guidance=pull, integration=asked)),
+        ("held actions", Conditioning(held=held, values=values, integration=requested)),
+        ("guidance", Conditioning(guidance=pull, integration=requested)),
     ):
         with pytest.raises(ObservationError, match=f"{what} and solver 'ab2' were both asked for.*take .*'euler'"):
             model.denoise(cache, noise, 3, conditioning=one)
     with pytest.raises(ObservationError, match=r"token times and a time grid .* were both given"):
-        model.denoise(cache, noise, 3, conditioning=Conditioning(TokenTimes.of(grid), integration=asked))
+        model.denoise(cache, noise, 3, conditioning=Conditioning(TokenTimes.of(grid), integration=requested))
     with pytest.raises(ObservationError, match=r"a loop of 5 steps was asked for.*takes 3"):
-        model.denoise(cache, noise, 5, conditioning=Conditioning(integration=asked))
+        model.denoise(cache, noise, 5, conditioning=Conditioning(integration=requested))
 
 
 # --- the engine -------------------------------------------------------------------------------------------------------
@@ -216,11 +218,11 @@ def test_the_engines_operations_equal_the_reference(engine: OnCpu, solver: Solve
     plain = engine.sample(observation, noise, 3).actions
     for times in (UNEVEN, tuple(0.6 * t for t in UNEVEN)):
         integration = Integration(solver, times)
-        asked, steps = Conditioning(integration=integration), integration.evaluations
-        expected = golden_model(engine.config.kind).sample(observation, noise, steps, conditioning=asked)
-        found = engine.sample(observation, noise, steps, conditioning=asked).actions
+        requested, steps = Conditioning(integration=integration), integration.evaluations
+        expected = golden_model(engine.config.kind).sample(observation, noise, steps, conditioning=requested)
+        found = engine.sample(observation, noise, steps, conditioning=requested).actions
         torch.testing.assert_close(found, expected, atol=2e-5, rtol=2e-5)
-        trace = engine.intermediates(observation, noise, steps, conditioning=asked)
+        trace = engine.intermediates(observation, noise, steps, conditioning=requested)
         assert trace["v_t"].shape[0] == steps and torch.equal(trace["actions"], found)
     assert torch.equal(engine.sample(observation, noise, 3).actions, plain), "plain calls keep their bits"
 
@@ -229,37 +231,37 @@ def test_the_engines_operations_equal_the_reference(engine: OnCpu, solver: Solve
 @pytest.mark.parametrize("by_token", [True, False])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_fuseds_kernels_evaluate_a_solvers_loop(
-    kernels: type[TwinKernel], solver: Solver, by_token: bool, monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], solver: Solver, by_token: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on Hopper, where one kernel takes any times, and as elsewhere, where each time has a kernel."""
     backend, case = fused(), golden_cases()["b_third_masked"]
     monkeypatch.setattr(type(backend), "_times_by_token", by_token)
     integration = Integration(solver, UNEVEN)
-    asked, steps = Conditioning(integration=integration), integration.evaluations
+    requested, steps = Conditioning(integration=integration), integration.evaluations
     plain = backend.sample(case.observation, case.noise, 3).actions
-    expected = golden_model("pi05").sample(case.observation, case.noise, steps, conditioning=asked)
-    found = backend.sample(case.observation, case.noise, steps, conditioning=asked).actions
+    expected = golden_model("pi05").sample(case.observation, case.noise, steps, conditioning=requested)
+    found = backend.sample(case.observation, case.noise, steps, conditioning=requested).actions
     torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
     assert torch.equal(backend.sample(case.observation, case.noise, 3).actions, plain)
-    (told,) = backend.describe()["denoising"]
-    assert told == "one CUDA kernel"
+    (reported,) = backend.describe()["denoising"]
+    assert reported == "one CUDA kernel"
     made = kernels.made[1:]
     assert {kernel.by_token for kernel in made} == {by_token}
     assert len(made) == (1 if by_token else len(set(integration.evaluated)))
     before = sum(kernel.launches for kernel in made)
-    backend.sample(case.observation, case.noise, steps, conditioning=asked)
+    backend.sample(case.observation, case.noise, steps, conditioning=requested)
     launches = sum(kernel.launches for kernel in made) - before
     assert launches == (1 if by_token and integration.is_euler else steps)
 
 
 def test_kernels_of_a_solvers_loop_are_forgotten_with_it_unless_another_loop_has_them(
-    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+    kernels: type[ReferenceKernel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     backend, case = fused(), golden_cases()["b_third_masked"]
     monkeypatch.setattr(type(backend), "_times_by_token", False)
     for solver in ("ab2", "exponential"):
-        asked = Conditioning(integration=Integration(solver, UNEVEN))
-        backend.sample(case.observation, case.noise, 3, conditioning=asked)
+        requested = Conditioning(integration=Integration(solver, UNEVEN))
+        backend.sample(case.observation, case.noise, 3, conditioning=requested)
     assert len(kernels.made) == 3, "both evaluate at the same times"
     loops = list(backend._graphs.loops)
     for loop, left in zip(loops, (3, 0), strict=True):
@@ -270,8 +272,8 @@ def test_kernels_of_a_solvers_loop_are_forgotten_with_it_unless_another_loop_has
 
 def test_a_solvers_loop_is_named_by_its_solver_and_grid() -> None:
     config = golden_model("pi05").config
-    asked = Conditioning(integration=Integration("ab2", UNEVEN))
-    loop = loop_of_call(asked, 3, 10, config)
+    requested = Conditioning(integration=Integration("ab2", UNEVEN))
+    loop = loop_of_call(requested, 3, 10, config)
     assert str(loop) == "H=10, 3 steps, ab2, t = 1, 0.7, 0.2, 0" and loop.rows == 3
     assert str(EulerLoop(1, 10, 0.5)) == "H=10, 1 steps, t = 0.5"
     euler = Conditioning(integration=Integration("euler", UNEVEN))

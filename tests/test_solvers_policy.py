@@ -44,10 +44,10 @@ def policy(tiny: Any) -> UnifiedPolicy:
 def test_a_policys_solver_is_a_calls_and_the_backends(tiny: Any, policy: UnifiedPolicy) -> None:
     observation = policy.example_observation()
     own = made(tiny, num_denoising_steps=3, solver="exponential", time_grid="shifted_to_actions")
-    told = {"num_denoising_steps": 3, "solver": "exponential", "time_grid": "shifted_to_actions"}
-    assert told.items() <= own.metadata.items()
-    asked: dict[str, Any] = {"num_steps": 3, "solver": "exponential", "time_grid": "shifted_to_actions"}
-    expected = policy.infer(observation, seed=0, **asked)["actions"]
+    reported = {"num_denoising_steps": 3, "solver": "exponential", "time_grid": "shifted_to_actions"}
+    assert reported.items() <= own.metadata.items()
+    requested: dict[str, Any] = {"num_steps": 3, "solver": "exponential", "time_grid": "shifted_to_actions"}
+    expected = policy.infer(observation, seed=0, **requested)["actions"]
     np.testing.assert_array_equal(own.infer(observation, seed=0)["actions"], expected)
     (both, _) = own.infer_batch([observation, observation], seed=0)
     np.testing.assert_allclose(both["actions"], expected, rtol=0, atol=1e-4)
@@ -215,8 +215,8 @@ def test_infer_takes_a_solver_and_times(tmp_path: Path, policy: UnifiedPolicy) -
     expected = policy.infer(policy.example_observation(), seed=0, solver="ab2", time_grid=UNEVEN)["actions"]
     np.testing.assert_allclose(np.load(tmp_path / "out.npz")["actions"], expected, rtol=0, atol=1e-5)
     assert "the solver is 'rk4'" in refusal(turbopi(*options, "--solver", "rk4"), whole=False)
-    told = refusal(turbopi(*options, "--time-grid", "1,half,0"), whole=False)
-    assert "--time-grid" in told and "isn't times with commas between them" in told
+    reported = refusal(turbopi(*options, "--time-grid", "1,half,0"), whole=False)
+    assert "--time-grid" in reported and "isn't times with commas between them" in reported
 
 
 @pytest.mark.slow

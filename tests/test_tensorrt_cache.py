@@ -81,9 +81,9 @@ def test_a_stale_engine_is_refused_with_the_reason_and_replaced(
     later = EngineCache(cache.root, dataclasses.replace(ENVIRONMENT, **changed))
     with pytest.raises(StaleEngine, match=said):
         later.get(specification())
-    told: list[str] = []
-    assert later.get_or_build(specification(), Builder(b"new"), told.append) == (b"new", "built")
-    assert len(told) == 1 and said in told[0] and "building it again" in told[0]
+    reported: list[str] = []
+    assert later.get_or_build(specification(), Builder(b"new"), reported.append) == (b"new", "built")
+    assert len(reported) == 1 and said in reported[0] and "building it again" in reported[0]
     assert later.get(specification()) == b"new"
 
 
@@ -142,9 +142,11 @@ def test_a_full_disk_leaves_what_was_there(cache: EngineCache) -> None:
 
 def test_an_engine_that_cannot_be_stored_is_used_and_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    cache, told = EngineCache(tmp_path / "file" / "engines", ENVIRONMENT), list[str]()
-    assert cache.get_or_build(specification(), Builder(), told.append) == (b"plan", "built")
-    assert len(told) == 2 and "isn't kept" in told[1] and str(cache.folder) in told[1], "it can't be read either"
+    cache, reported = EngineCache(tmp_path / "file" / "engines", ENVIRONMENT), list[str]()
+    assert cache.get_or_build(specification(), Builder(), reported.append) == (b"plan", "built")
+    assert len(reported) == 2 and "isn't kept" in reported[1] and str(cache.folder) in reported[1], (
+        "it can't be read either"
+    )
     with pytest.raises(OutputError, match="can't make the folder"):
         cache.get_or_build(specification(), Builder(), keep=True)
 

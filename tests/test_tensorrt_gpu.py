@@ -127,7 +127,7 @@ def test_an_exported_graph_is_an_engine(
 
     export = exports(fp8)
     inputs = graph_inputs(graph)
-    shapes = shapes_of(export, graph, pictures=3, prompt=21, prefix=789, horizon=10)
+    shapes = shapes_of(export, graph, camera_images=3, prompt=21, prefix=789, horizon=10)
     assert shapes == {name: tuple(value.shape) for name, value in inputs.items()}
     exact = dict(zip(export.manifest["graphs"][graph]["outputs"], Sessions(export).run(graph, **inputs), strict=True))
     plan = build_onnx(tensorrt.library(), export.graph(graph), shapes)

@@ -27,13 +27,13 @@ def error(ours: Tensor, exact: Tensor) -> float:
     return float((ours - exact).norm() / exact.norm())
 
 
-def pictures(count: int, seed: int = 0) -> Tensor:
+def camera_images(count: int, seed: int = 0) -> Tensor:
     return torch.randint(0, 256, (count, 224, 224, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_vision_equals_the_reference(cameras: int) -> None:
-    model, images = golden_model("pi05"), pictures(cameras)
+    model, images = golden_model("pi05"), camera_images(cameras)
     weights = packed()
     x = embed_patches(images, weights.patch, weights.position, torch.float32)
     ours = networks.vision(OPS, model.config, weights, x, cameras, "f32")
@@ -41,7 +41,7 @@ def test_vision_equals_the_reference(cameras: int) -> None:
 
 
 def test_half_precision_vision_stays_near_the_reference() -> None:
-    model, images = golden_model("pi05"), pictures(2)
+    model, images = golden_model("pi05"), camera_images(2)
     weights = packed()
     x = embed_patches(images, weights.patch, weights.position, torch.float16)
     ours = networks.vision(OPS, model.config, weights, x, 2, "f16")

@@ -40,8 +40,8 @@ def test_tiles_of_other_machine_code_are_taken_out_and_the_rest_is_todays(docume
     stale = replace(document, fingerprints=document.fingerprints | {"hopper": "another"})
     before = {str(one.key): "code" for one in document.tiles if one.kernels == "hopper"}
     changed = next(iter(before))
-    new, gone = carried(stale, before, before | {changed: "other code"})
-    assert [str(one.key) for one in gone] == [changed]
+    new, lost = carried(stale, before, before | {changed: "other code"})
+    assert [str(one.key) for one in lost] == [changed]
     assert new.tiles == [one for one in document.tiles if str(one.key) != changed]
     assert new.fingerprints == document.fingerprints | {"hopper": fingerprint("hopper")}
 

@@ -14,7 +14,7 @@ from load_test import stand_in
 from load_test.__main__ import main, show
 from load_test.connections import connect, kind_of
 from load_test.document import COLUMNS, Load, LoadDocument, Spread, read_load, summary
-from load_test.observations import OF_A_CLIENT, observations, picture_size, shapes
+from load_test.observations import OF_A_CLIENT, image_size, observations, shapes
 from load_test.run import Wanted, run
 from load_test.schedule import ERROR_PAUSE, Clock, Refused, Request, closed_loop, due_times, open_loop
 from rich.console import Console
@@ -128,7 +128,7 @@ LOAD = Load(
     warmup_seconds=0.0,
     seed=0,
     robot="libero",
-    pictures=[(224, 224, 3)],
+    camera_images=[(224, 224, 3)],
     message_bytes=1,
 )
 
@@ -201,12 +201,12 @@ def test_a_text_frame_is_counted_by_its_beginning(text: str, kind: str) -> None:
 def test_pictures_have_the_size_that_is_asked_for_in_the_robots_layout(
     robot: str, expected: list[tuple[int, ...]]
 ) -> None:
-    name, made = observations(robot, None, picture_size("640x480"), 2, 0)
+    name, made = observations(robot, None, image_size("640x480"), 2, 0)
     assert name == robot and set(shapes(made[0][0])) == set(expected)
     assert len(made) == 2 and all(len(own) == OF_A_CLIENT for own in made)
     messages = [pack(one) for own in made for one in own]
-    assert len(set(messages)) == 2 * OF_A_CLIENT  # no picture is sent by two, or twice in turn
-    again = observations(robot, None, picture_size("640x480"), 2, 0)[1]
+    assert len(set(messages)) == 2 * OF_A_CLIENT  # no image is sent by two, or twice in turn
+    again = observations(robot, None, image_size("640x480"), 2, 0)[1]
     assert [pack(one) for own in again for one in own] == messages
 
 
@@ -221,8 +221,8 @@ def test_a_recorded_observation_is_sent_with_new_pictures(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("text", ["640", "0x3", "ax3", "-3x3", "640x480x3", "10000x3", "²x3"])
 def test_what_is_no_size_is_refused_by_name(text: str) -> None:
-    with pytest.raises(ConfigError, match=f"--pictures {text}: expected"):
-        picture_size(text)
+    with pytest.raises(ConfigError, match=f"--images {text}: expected"):
+        image_size(text)
 
 
 @pytest.mark.parametrize(
@@ -253,18 +253,18 @@ class Counting(FakePolicy):
     def __init__(self, wrong: int = 0) -> None:
         super().__init__()
         self.calls, self.wrong, self._lock = 0, wrong, threading.Lock()
-        self.pictures: set[bytes] = set()
+        self.camera_images: set[bytes] = set()
 
     def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
             self.calls += 1
-            self.pictures.add(obs["observation/image"].tobytes())
+            self.camera_images.add(obs["observation/image"].tobytes())
             if self.wrong and self.calls % self.wrong == 0:
                 raise ObservationError("another one")
         return super().infer(obs)
 
 
-QUICK = {"seconds": 1.0, "warmup": 0.0, "drain_s": 100.0, "robot": "libero", "pictures": (8, 6)}
+QUICK = {"seconds": 1.0, "warmup": 0.0, "drain_s": 100.0, "robot": "libero", "images": (8, 6)}
 
 
 def test_every_request_of_an_open_loop_is_sent_and_counted_once() -> None:
@@ -276,13 +276,13 @@ def test_every_request_of_an_open_loop_is_sent_and_counted_once() -> None:
     assert (document.answered, document.errors, document.unsent) == (15, {"bad observation": 5}, 0)
     assert sum(one.answered for one in document.by_client) == 15 and len(document.by_client) == 3
     assert len(document.clients.processes) == 2
-    assert len(policy.pictures) == 3 * OF_A_CLIENT
+    assert len(policy.camera_images) == 3 * OF_A_CLIENT
     latency, infer, overhead = document.latency_ms, document.infer_ms, document.overhead_ms
     assert latency is not None and infer is not None and overhead is not None
     assert latency.mean == pytest.approx(infer.mean + overhead.mean)
     assert infer.min > 0 and overhead.min > 0
     assert document.server["policy"] == "fake"
-    assert document.load.pictures == [(8, 6, 3)] * 2 and document.load.robot == "libero"
+    assert document.load.camera_images == [(8, 6, 3)] * 2 and document.load.robot == "libero"
 
 
 def test_a_closed_loop_counts_what_was_answered_and_its_document_comes_out_as_it_went_in(
@@ -307,8 +307,8 @@ def test_a_closed_loop_counts_what_was_answered_and_its_document_comes_out_as_it
 
 def test_the_robot_is_the_one_that_the_server_names() -> None:
     policy = Counting()
-    told = {"robot": "libero", "numbers": np.arange(2), "none": float("nan"), "tokenizer": "/home/ada/sp.model"}
-    policy.metadata = {**policy.metadata, **told}
+    reported = {"robot": "libero", "numbers": np.arange(2), "none": float("nan"), "tokenizer": "/home/ada/sp.model"}
+    policy.metadata = {**policy.metadata, **reported}
     quick = {**QUICK, "robot": None}
     with running(policy) as server:
         document = run(Wanted(url=server.url, arrivals="fixed", rate=2.0, **quick), [])  # type: ignore[arg-type]
@@ -360,7 +360,7 @@ def test_openpis_client_is_driven_in_its_own_environment() -> None:
         document = run(replace(wanted, python=str(python)), [])
     assert (document.requests, document.answered, document.errors) == (9, 6, {"bad observation": 3})
     assert document.load.client == "openpi" and document.overhead_ms is not None
-    assert len(policy.pictures) == OF_A_CLIENT
+    assert len(policy.camera_images) == OF_A_CLIENT
 
 
 def test_a_process_of_clients_that_fails_says_why() -> None:

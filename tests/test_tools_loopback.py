@@ -19,8 +19,8 @@ def test_the_work_isnt_counted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_command_tells_quantiles(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--request", "10", "--answer", "10", "--work", "0.1", "--count", "1"]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith("1 round trips: median ") and "beside the work" in told
+    reported = capsys.readouterr().out
+    assert reported.startswith("1 round trips: median ") and "beside the work" in reported
 
 
 def test_another_process_that_ends_is_told_and_not_waited_for() -> None:

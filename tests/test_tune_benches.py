@@ -191,7 +191,7 @@ def statistics_of(sums: bf16.Sums, width: int, eps: float) -> tuple[Tensor, Tens
     return mean, (total[:, 1:] - mean.square() + eps).rsqrt()
 
 
-def matmul_twin(
+def matmul_reference(
     a: Tensor, weight: Any, tile: Tile, epilogue: Any, bias: Any = None, out: Any = None, **more: Any
 ) -> Any:
     """`bf16.matmul`, in float64, for every layout that it asserts."""
@@ -208,7 +208,7 @@ def matmul_twin(
     )
 
 
-def fp8_twin(
+def fp8_reference(
     a: Tensor,
     weight: Any,
     tile: Tile,
@@ -247,9 +247,9 @@ def stored(result: Tensor, tile: Tile, epilogue: str, out: Any, residual: Any, i
 
 
 @pytest.fixture
-def twins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hopper, "matmul", matmul_twin)
-    monkeypatch.setattr(hopper, "matmul_fp8", fp8_twin)
+def references(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hopper, "matmul", matmul_reference)
+    monkeypatch.setattr(hopper, "matmul_fp8", fp8_reference)
 
 
 def smaller(one: Operation) -> Operation:
@@ -258,7 +258,7 @@ def smaller(one: Operation) -> Operation:
     return replace(one, rows=64, columns=one.columns if square else min(one.columns, 1152), inner=min(one.inner, 1152))
 
 
-@pytest.mark.usefixtures("twins", "plain_norms")
+@pytest.mark.usefixtures("references", "plain_norms")
 @pytest.mark.parametrize("precision", ["bf16", "fp8"])
 def test_hoppers_products_are_given_what_makes_their_forms_right(
     precision: str, monkeypatch: pytest.MonkeyPatch

@@ -183,12 +183,14 @@ def test_an_operation_whose_usual_tile_fails_is_named_and_the_others_are_measure
 
 
 def test_progress_is_told_of_operations_candidates_and_results() -> None:
-    told: list[object] = []
+    reported: list[object] = []
     progress = Progress(
-        lambda text, total: told.append((text, total)), lambda: told.append("."), lambda one: told.append(one.gained)
+        lambda text, total: reported.append((text, total)),
+        lambda: reported.append("."),
+        lambda one: reported.append(one.gained),
     )
     outcome: Outcome = tune(planned(512), good, lambda found: None, progress=progress)
-    assert told == [("1/1 prefix qkv, fp8, 512 rows", 2), ".", ".", 1.0] and len(outcome.measured) == 1
+    assert reported == [("1/1 prefix qkv, fp8, 512 rows", 2), ".", ".", 1.0] and len(outcome.measured) == 1
 
 
 def test_an_operation_is_timed_beside_what_was_found_before_it() -> None:

@@ -33,20 +33,20 @@ def recording(ran: Ran) -> Ops:
     """Plain operations that count their sizes: (operation, rows, columns, inner). Products of a norm count as such."""
     last: list[tuple[str, Tensor]] = [("", torch.empty(0))]  # the norm that ran last, and its result
 
-    def norm(name: str, twin: Any) -> Any:
+    def norm(name: str, reference: Any) -> Any:
         def run(*given: Any, **more: Any) -> tuple[Tensor, Tensor]:
-            x, normed = twin(*given, **more)
+            x, normed = reference(*given, **more)
             last[0] = name, normed
             return x, normed
 
         return run
 
-    def product(name: str, twin: Any) -> Any:
+    def product(name: str, reference: Any) -> Any:
         def run(x: Tensor, weight: Tensor, *rest: Any, **more: Any) -> Tensor:
             rows, columns = x.shape[0], weight.shape[0] // (2 if name == "geglu" else 1)
             in_front = last[0][0] if x is last[0][1] else None
             ran[named(name, in_front), rows, columns, weight.shape[1]] += 1
-            return twin(x, weight, *rest, **more)
+            return reference(x, weight, *rest, **more)
 
         return run
 
@@ -114,13 +114,13 @@ def test_a_batchs_operations(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> Non
     model, ran, batch, cameras, slots = golden_model(kind), Ran(), 2, 1, 16
     config, ops, cpu = model.config, recording(ran), torch.device("cpu")
     weights = pack(config, dict(model.state_dict()))
-    pictures = Images(config, weights, ops, batch * cameras, False, 0)
-    buffers = BatchBuffers(config, weights, ops, BatchSize(batch, batch * cameras), pictures, batch * slots)
+    camera_images = Images(config, weights, ops, batch * cameras, False, 0)
+    buffers = BatchBuffers(config, weights, ops, BatchSize(batch, batch * cameras), camera_images, batch * slots)
     prefix = PackedPrefix(buffers, batch * slots)
     prefix.write([cameras] * batch, [np.ones(slots, np.int64)] * batch)
     table = modulation(config, weights.conditioning, STEPS)
     loop = BatchLoop(buffers, EulerLoop(STEPS, HORIZON), weights, None if table is None else table.to(cpu))
-    pictures.run()
+    camera_images.run()
     prefix.run()
     loop.run()
     assert ran == counted(kind, Call(cameras, slots, batch), monkeypatch)

@@ -139,7 +139,7 @@ def test_tiles_of_kernels_that_have_not_changed_stay(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "reported"),
     [
         ({"driver": "570.1"}, "with driver 570.1, and here it is 580.95.05"),
         ({"triton": "3.5.1"}, "with Triton 3.5.1, and here it is 3.6.0"),
@@ -147,11 +147,11 @@ def test_tiles_of_kernels_that_have_not_changed_stay(tmp_path: Path) -> None:
     ],
 )
 def test_the_users_file_of_another_driver_or_triton_is_named(
-    tmp_path: Path, changed: dict[str, Any], told: str
+    tmp_path: Path, changed: dict[str, Any], reported: str
 ) -> None:
     kept(tmp_path, tile_document(**changed))
     tiles = find_tiles(ADA, cache=tmp_path, shipped=tmp_path / "none")
-    assert not tiles.table.tiles and told in tiles.unused[0]
+    assert not tiles.table.tiles and reported in tiles.unused[0]
     kept(tmp_path, tile_document())
     assert len(find_tiles(ADA, cache=tmp_path, shipped=tmp_path / "none").table) == 1
 

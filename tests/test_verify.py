@@ -373,8 +373,8 @@ def refusal_of(*arguments: object) -> str:
 def test_anothers_file_is_not_replaced_by_a_certificate(tmp_path: Path) -> None:
     file = tmp_path / "verify.json"
     file.write_text('{"floors": {}}')
-    told = refusal_of("--report", tmp_path)
-    assert f"{file} is there and isn't a certificate of `turbopi verify`, so it isn't replaced" in told
+    reported = refusal_of("--report", tmp_path)
+    assert f"{file} is there and isn't a certificate of `turbopi verify`, so it isn't replaced" in reported
     assert file.read_text() == '{"floors": {}}'
 
 
@@ -400,7 +400,7 @@ def test_errors_pool_what_is_added() -> None:
 def test_slots_nobody_attends_to_are_left_out() -> None:
     mask = np.array([True, False])
     inputs = ModelInputs(np.zeros(0), mask, np.zeros(3), np.array([True, True, False]), np.zeros(0))
-    slots = torch.arange(7.0)  # two pictures of two tokens, three of the prompt
+    slots = torch.arange(7.0)  # two images of two tokens, three of the prompt
     kv = slots[None, None, :, None, None].expand(2, 1, 7, 1, 1)
     tensors = tensors_of({"prefix_embs": slots[None, :, None], "kv_k": kv}, inputs, with_prefix=True)
     for place in (Place("prefix_embs"), Place("kv_k", 0), Place("kv_k", 1)):

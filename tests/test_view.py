@@ -81,9 +81,9 @@ def test_a_recordings_calls_are_viewed_as_they_were(recording: tuple[Path, dict[
             np.testing.assert_array_equal(one.actions, truth.result["actions"])
             np.testing.assert_array_equal(one.numbers["observation/state"], truth.observation["observation/state"])
             assert one.timing == {"vision": 1.5 + number, "total": 7.25 + number, "server": 8.5 + number}
-            picture = np.asarray(Image.open(io.BytesIO(one.pictures["observation/image"].data)))
-            np.testing.assert_array_equal(picture, truth.observation["observation/image"])
-            small = np.asarray(Image.open(io.BytesIO(one.pictures["observation/wrist_image"].data)))
+            camera_image = np.asarray(Image.open(io.BytesIO(one.camera_images["observation/image"].data)))
+            np.testing.assert_array_equal(camera_image, truth.observation["observation/image"])
+            small = np.asarray(Image.open(io.BytesIO(one.camera_images["observation/wrist_image"].data)))
             given = truth.observation["observation/wrist_image"].transpose(1, 2, 0)
             np.testing.assert_allclose(small / 255, given, atol=0.5 / 255 + 1e-6)
 
@@ -118,10 +118,10 @@ class Arm(FakePolicy):
 
 
 @contextmanager
-def asking(server: PolicyServer) -> Iterator[None]:
+def requesting(server: PolicyServer) -> Iterator[None]:
     """A robot that asks on and on, once wrongly."""
     done = threading.Event()
-    picture = np.full((20, 30, 3), 99, np.uint8)
+    camera_image = np.full((20, 30, 3), 99, np.uint8)
 
     def run() -> None:
         with connect(server.url, compression=None) as robot:
@@ -129,7 +129,7 @@ def asking(server: PolicyServer) -> Iterator[None]:
             robot.send(pack({"prompt": "lacks its state"}))
             robot.recv()
             while not done.wait(0.02):
-                robot.send(pack(observation("go on") | {"front": picture}))
+                robot.send(pack(observation("go on") | {"front": camera_image}))
                 robot.recv()
 
     thread = threading.Thread(target=run)
@@ -142,7 +142,7 @@ def asking(server: PolicyServer) -> Iterator[None]:
 
 
 def test_a_live_servers_calls_and_errors_are_viewed() -> None:
-    with running(Arm()) as server, asking(server):
+    with running(Arm()) as server, requesting(server):
         watched = LiveServer(server.url.replace("ws://", "http://"))
         try:
             assert watched.hello.policy["robot"] == "libero"
@@ -159,7 +159,7 @@ def test_a_live_servers_calls_and_errors_are_viewed() -> None:
     assert sorted({one.number for one in calls}) == [one.number for one in calls]
     assert first.actions is not None and first.actions[0, 0] == 0.5 and (first.actions[1:] == 0.25).all()
     np.testing.assert_array_equal(first.numbers["observation/state"], observation()["observation/state"])
-    assert np.asarray(Image.open(io.BytesIO(first.pictures["front"].data))).shape == (20, 30, 3)
+    assert np.asarray(Image.open(io.BytesIO(first.camera_images["front"].data))).shape == (20, 30, 3)
     assert first.timing["infer"] == 2.0
     (trouble,) = troubles  # once, though every frame has it
     assert trouble.serious and "observation/state" in trouble.text
@@ -327,15 +327,15 @@ def test_without_a_rate_no_action_is_said_to_be_executed(
 @with_rerun
 def test_a_live_server_is_saved_below_each_robots_address(tmp_path: Path) -> None:
     file = tmp_path / "live.rrd"
-    with running(Arm()) as server, asking(server):
+    with running(Arm()) as server, requesting(server):
         ended = turbopi("view", server.url, "--save", file, "--seconds", 3, "--json")
     assert ended.exit_code == 0, ended.output
-    told = json.loads(ended.stdout)
-    assert told["calls"] > 0 and told["troubles"] == 1
+    reported = json.loads(ended.stdout)
+    assert reported["calls"] > 0 and reported["troubles"] == 1
     found = read_back(file)
     (camera,) = (entity for entity in found if entity.endswith("/cameras/front"))
     assert camera.replace("\\", "").startswith("/127.0.0.1:")
-    assert len(found[camera]) == told["calls"]
+    assert len(found[camera]) == reported["calls"]
     assert base64.b64encode(bytes(found[camera][0]["EncodedImage:blob"][0])).startswith(b"/9j/")  # a JPEG
     assert len(found["/errors"]) == 1
 

@@ -125,8 +125,8 @@ def test_a_strict_policy_refuses_what_warmup_didnt_cover_and_says_what_to_do() -
     policy.infer(seen_by(2, policy), seed=0)
     with pytest.raises(ObservationError, match=r"needs 3 cameras, .* Warm is: 2 cameras\. .*warmup\(cameras=3\)"):
         policy.infer(seen_by(3, policy), seed=0)
-    told = r"needs 2 cameras, H=10, 5 steps, .*'cuda_graph'.* Warm is: 2 cameras, H=10, 2 steps\."
-    with pytest.raises(ObservationError, match=told + r".*warmup\(cameras=2, horizons=10, steps=5\)"):
+    reported = r"needs 2 cameras, H=10, 5 steps, .*'cuda_graph'.* Warm is: 2 cameras, H=10, 2 steps\."
+    with pytest.raises(ObservationError, match=reported + r".*warmup\(cameras=2, horizons=10, steps=5\)"):
         policy.infer(seen_by(2, policy), seed=0, num_steps=5)
     with pytest.raises(ObservationError, match=r"needs 2 cameras, H=6, 2 steps"):
         policy.infer(seen_by(2, policy), seed=0, horizon=6)
@@ -259,10 +259,10 @@ def test_a_backend_with_engines_for_one_horizon_refuses_another(
         name for name in backends.BACKENDS if name.startswith("tensorrt")
     }
     monkeypatch.setattr(type(reference.backend), "any_horizon", False)
-    told = "backend 'pytorch' has engines for the config's action horizon of 10, not for 6"
-    with pytest.raises(ObservationError, match=told):
+    reported = "backend 'pytorch' has engines for the config's action horizon of 10, not for 6"
+    with pytest.raises(ObservationError, match=reported):
         reference.infer(reference.example_observation(), horizon=6)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=reported):
         reference.warmup(horizons=[10, 6])
     assert reference.infer(reference.example_observation(), horizon=10, num_steps=1)["actions"].shape == (10, 32)
 

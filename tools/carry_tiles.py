@@ -102,9 +102,9 @@ def other_sources(package: Path) -> dict[str, str]:
 
 def carried(document: TileFile, before: dict[str, str], now: dict[str, str]) -> tuple[TileFile, list[TunedTile]]:
     """The document under today's source, and the tiles that it has no more."""
-    gone = [one for one in document.tiles if str(one.key) in now and before[str(one.key)] != now[str(one.key)]]
-    kept = [one for one in document.tiles if one not in gone]
-    return replace(document, tiles=kept, fingerprints=document.fingerprints | {"hopper": fingerprint("hopper")}), gone
+    lost = [one for one in document.tiles if str(one.key) in now and before[str(one.key)] != now[str(one.key)]]
+    kept = [one for one in document.tiles if one not in lost]
+    return replace(document, tiles=kept, fingerprints=document.fingerprints | {"hopper": fingerprint("hopper")}), lost
 
 
 def main() -> int:
@@ -157,14 +157,14 @@ def carry(file: Path, old: Path, revision: str, check: bool) -> int:
     same = codes == now
     if not same:
         codes, now = at_revision()["codes"], compiled(document.tiles)
-    new, gone = carried(document, codes, now)
-    for one in gone:
+    new, lost = carried(document, codes, now)
+    for one in lost:
         print(f"{file.name}: {one.name}, {one.rows} rows, {one.numbers} has other machine code")
     how = "compiled from the same source" if same else "of the same machine code"
-    print(f"{file.name}: {len(new.tiles)} tiles kept, {how}; {len(gone)} taken out")
+    print(f"{file.name}: {len(new.tiles)} tiles kept, {how}; {len(lost)} taken out")
     if not check:
         write_tile_file(new, file)
-    return int(check and bool(gone))
+    return int(check and bool(lost))
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def main() -> None:
     which.add_argument("--random-weights", metavar="PRESET")
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--precision", default="bf16")
-    parser.add_argument("--size", default="480x640", help="HEIGHTxWIDTH of the pictures")
+    parser.add_argument("--size", default="480x640", help="HEIGHTxWIDTH of the images")
     parser.add_argument("--calls", type=int, default=200)
     arguments = parser.parse_args()
     height, width = map(int, arguments.size.split("x"))

@@ -17,8 +17,8 @@ def main(port: int, sources: str) -> None:
     from turbopi.realtime import RealTimeExecutor
 
     client = WebsocketClientPolicy(host="127.0.0.1", port=port)
-    asked: list[dict[str, Any]] = [{"turbopi/step": 0}, {"turbopi/step": np.int64(3), "turbopi/delay": np.int32(1)}]
-    answers = [client.infer({"place": 0.0, **keys})["real_time"] for keys in asked]
+    requested: list[dict[str, Any]] = [{"turbopi/step": 0}, {"turbopi/step": np.int64(3), "turbopi/delay": np.int32(1)}]
+    answers = [client.infer({"place": 0.0, **keys})["real_time"] for keys in requested]
     try:
         client.infer({"place": 0.0, "turbopi/step": 1})
         refused = None

@@ -125,7 +125,7 @@ def besiege(
             found.violate(f"the server ended with {server.process.returncode}", " ".join(server.command))
         if good is not None:
             windows = ((first, start), (start, end), (end + 1.0, last))
-            seen["good"] = _good(found, *(good.asked(*window) for window in windows))
+            seen["good"] = _good(found, *(good.requested(*window) for window in windows))
     found.bars += server_bars(siege.limits, seen)
     return found, seen
 

@@ -150,12 +150,12 @@ def _recordings(here: Path, found: Found) -> None:
                 import time
 
                 time.sleep(4)
-                answers = good.asked(0, float("inf"))
+                answers = good.requested(0, float("inf"))
             import signal
 
             if server.end(signal.SIGTERM, 60) is None or server.process.returncode != 0:
                 found.violate(f"the server with a full disk ended with {server.process.returncode}", line)
-            told = "couldn't be recorded" in server.text()
+            reported = "couldn't be recorded" in server.text()
         found.count += 1
         found.outcomes["recording: answers"] += len(answers)
         for _, said in answers:
@@ -163,5 +163,5 @@ def _recordings(here: Path, found: Found) -> None:
                 found.violate(f"recording to a full disk: {said}", line)
         calls = check_recording(disk, killed=False, fault=lambda what: found.violate(f"on a full disk: {what}", line))
         found.outcomes["recording: calls read back"] += calls
-        if calls < len(answers) and not told:
+        if calls < len(answers) and not reported:
             found.violate("calls were lost to a full disk, and the log doesn't say so", line)

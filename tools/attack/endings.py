@@ -123,7 +123,7 @@ def _kill_server(sent: signal.Signals, after: float, recording: Path, folder: Pa
     ):
         time.sleep(after)
         took = server.end(sent, WAIT_S)
-        answered = sum(said == "ok" for _, said in good.asked(0, float("inf")))
+        answered = sum(said == "ok" for _, said in good.requested(0, float("inf")))
     line = f"{' '.join(server.command)}  # {sent.name}"
     found.count += 1
     found.outcomes[f"{sent.name}: exit {server.process.returncode}"] += 1

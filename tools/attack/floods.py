@@ -15,7 +15,7 @@ from turbopi.realtime.wire import pack
 SLOW_WALK = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19998  # as many values as a message may have: the most work a byte
 # The most headers of different kinds that a message may have, which no run of equal ones makes cheap.
 WORST_WALK = b"\xdd\0\0\x0f\0" + b"\xa1a\x01" * 1920
-GONE = (OSError, HandshakeRefused, asyncio.TimeoutError, asyncio.IncompleteReadError)
+LOST = (OSError, HandshakeRefused, asyncio.TimeoutError, asyncio.IncompleteReadError)
 RECONNECT_S = 0.1
 
 
@@ -30,7 +30,7 @@ async def _attackers(arena: Arena, count: int, attack: Callable[[], Awaitable[No
                 await asyncio.wait_for(attack(), end - time.monotonic())
             except asyncio.TimeoutError:
                 return
-            except GONE as error:
+            except LOST as error:
                 status = f" {error.status}" if isinstance(error, HandshakeRefused) else ""
                 arena.found.outcomes[f"lost: {type(error).__name__}{status}"] += 1
                 await asyncio.sleep(RECONNECT_S)
@@ -215,7 +215,7 @@ async def idle(arena: Arena) -> None:
             try:
                 held.append(await Raw.open(arena.port, limit=2**12))
                 arena.found.outcomes["let in"] += 1
-            except GONE as error:
+            except LOST as error:
                 status = error.status if isinstance(error, HandshakeRefused) else type(error).__name__
                 arena.found.outcomes[f"turned away: {status}"] += 1
             arena.found.count += 1
@@ -246,7 +246,7 @@ async def no_descriptors(arena: Arena) -> None:
     held: list[asyncio.StreamWriter] = []
 
     async def connect() -> None:
-        with contextlib.suppress(*GONE):
+        with contextlib.suppress(*LOST):
             reader, writer = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", arena.port), 5)
             held.append(writer)
             writer.write(request(arena.port))

@@ -21,19 +21,19 @@ PAUSE_S = 0.005  # what a robot does between its calls
 RETRY_S = 0.1
 
 
-def observation(number: int, picture: np.ndarray) -> dict[str, object]:
+def observation(number: int, camera_image: np.ndarray) -> dict[str, object]:
     """LIBERO's keys, and a prompt that makes each observation another."""
     return {
-        "observation/image": picture,
-        "observation/wrist_image": picture[::-1],
+        "observation/image": camera_image,
+        "observation/wrist_image": camera_image[::-1],
         "observation/state": np.linspace(-0.5, 0.5, 8),
         "prompt": f"pick up the bowl {number}",
     }
 
 
-def ask(client: Blocking, number: int, picture: np.ndarray, digests: bool) -> tuple[float, str]:
+def ask(client: Blocking, number: int, camera_image: np.ndarray, digests: bool) -> tuple[float, str]:
     """Milliseconds, and "ok" or what was wrong. Raises OSError."""
-    message = pack(observation(number, picture))
+    message = pack(observation(number, camera_image))
     started = time.monotonic()
     client.send(message)
     reply = client.receive()
@@ -45,27 +45,27 @@ def ask(client: Blocking, number: int, picture: np.ndarray, digests: bool) -> tu
 
 
 def run(port: int, out: Path, pixels: int, headers: list[str]) -> None:
-    picture = np.random.default_rng(0).integers(0, 256, (pixels, pixels, 3), np.uint8)
+    camera_image = np.random.default_rng(0).integers(0, 256, (pixels, pixels, 3), np.uint8)
     client: Blocking | None = None
     digests, number = False, 0
     with out.open("a", buffering=1, encoding="utf-8") as lines:
         while True:
-            asked = time.monotonic()
-            lines.write(f"{asked:.4f}\t0\t?\n")
+            requested = time.monotonic()
+            lines.write(f"{requested:.4f}\t0\t?\n")
             try:
                 if client is None:
                     client = Blocking(port, *headers)
                     digests = decode(client.greeting).get("policy") == NAME
-                milliseconds, said = ask(client, number, picture, digests)
+                milliseconds, said = ask(client, number, camera_image, digests)
                 if said.startswith("closed"):
                     client.close()
                     client = None
             except (OSError, HandshakeRefused) as error:
-                milliseconds, said = (time.monotonic() - asked) * 1e3, f"lost: {type(error).__name__} {error}"
+                milliseconds, said = (time.monotonic() - requested) * 1e3, f"lost: {type(error).__name__} {error}"
                 if client is not None:
                     client.close()
                 client = None
-            lines.write(f"{asked:.4f}\t{milliseconds:.3f}\t{' '.join(said.split())}\n")
+            lines.write(f"{requested:.4f}\t{milliseconds:.3f}\t{' '.join(said.split())}\n")
             number += 1
             time.sleep(PAUSE_S if client is not None else RETRY_S)
 
@@ -74,7 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m attack.good", description=__doc__)
     parser.add_argument("port", type=int)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--pixels", type=int, default=224, help="of its two pictures")
+    parser.add_argument("--pixels", type=int, default=224, help="of its two images")
     parser.add_argument("--header", action="append", default=[])
     arguments = parser.parse_args()
     run(arguments.port, arguments.out, arguments.pixels, arguments.header)

@@ -182,7 +182,7 @@ class Watch:
         """What happened from `start` to `end` (monotonic seconds), and since then."""
         before = [sample for sample in self.samples if sample.at <= start] or self.samples[:1]
         during = [sample for sample in self.samples if sample.at >= start] or self.samples[-1:]
-        asked = [health for health in self.healths if start <= health.at <= end]
+        requested = [health for health in self.healths if start <= health.at <= end]
         text = self.server.text()
         return {
             "rss_mb": _three([s.rss / 2**20 for s in before], [s.rss / 2**20 for s in during]),
@@ -190,9 +190,9 @@ class Watch:
             "log_bytes": len(text.encode()) - log_before,
             "log_tracebacks": text.count(TRACEBACK),
             "health": {
-                "asked": len(asked),
-                "failed": sum(health.status != 200 for health in asked),
-                "worst_ms": round(max((health.milliseconds for health in asked), default=0.0), 1),
+                "asked": len(requested),
+                "failed": sum(health.status != 200 for health in requested),
+                "worst_ms": round(max((health.milliseconds for health in requested), default=0.0), 1),
             },
         }
 
@@ -227,7 +227,7 @@ class GoodClient:
     def __enter__(self) -> "GoodClient":
         self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, env=environment())
         deadline = time.monotonic() + START_S
-        while not self.asked(0.0, float("inf")):
+        while not self.requested(0.0, float("inf")):
             if self._process.poll() is not None or time.monotonic() > deadline:
                 self.__exit__()
                 raise RuntimeError("the good client doesn't come up")
@@ -239,7 +239,7 @@ class GoodClient:
             self._process.kill()
         self._process.wait()
 
-    def asked(self, start: float, end: float) -> list[tuple[float, str]]:
+    def requested(self, start: float, end: float) -> list[tuple[float, str]]:
         """(milliseconds, "ok" or the fault) of each request that was asked from `start` to `end`."""
         return answers(self._out.read_text(encoding="utf-8"), start, end, time.monotonic())
 
@@ -251,8 +251,8 @@ def answers(lines: str, start: float, end: float, now: float) -> list[tuple[floa
         if line.endswith("\n"):
             at, milliseconds, said = line[:-1].split("\t")
             found[at] = (float(milliseconds), said)
-    asked = [(float(at), *answer) for at, answer in found.items() if start <= float(at) <= end]
+    requested = [(float(at), *answer) for at, answer in found.items() if start <= float(at) <= end]
     waits = PATIENCE_S * 1e3
-    answered = [(ms, said) for _, ms, said in asked if said != "?"]
-    late = [(now - at) * 1e3 for at, _, said in asked if said == "?"]
+    answered = [(ms, said) for _, ms, said in requested if said != "?"]
+    late = [(now - at) * 1e3 for at, _, said in requested if said == "?"]
     return answered + [(ms, "no answer yet") for ms in late if ms > waits]

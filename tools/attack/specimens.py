@@ -167,7 +167,7 @@ def read_checkpoint(folder: str, config: str | None = None) -> None:
         weights = {name: _bits(tensor) for name, tensor in sorted(loaded.state.items())}
         return {"config": repr(checkpoint.config), "statistics": repr(checkpoint.norm_stats), "weights": weights}
 
-    _told(read)
+    _reported(read)
 
 
 def read_checkpoint_pi05(folder: str) -> None:
@@ -194,19 +194,19 @@ def read_observation(path: str) -> None:
         create_robot("libero").inputs(observation)
         return observation
 
-    _told(read)
+    _reported(read)
 
 
 def read_recording(folder: str) -> None:
     from turbopi.recordings import iter_recording
 
-    _told(lambda: [[observation, actions] for observation, actions in iter_recording(folder)])
+    _reported(lambda: [[observation, actions] for observation, actions in iter_recording(folder)])
 
 
 def read_calibration(folder: str) -> None:
     from turbopi.quantization.calibration_file import Quantization
 
-    _told(lambda: repr(Quantization.load(f"{folder}/fp8.json")))
+    _reported(lambda: repr(Quantization.load(f"{folder}/fp8.json")))
 
 
 def read_result(folder: str) -> None:
@@ -217,22 +217,22 @@ def read_result(folder: str) -> None:
         about = (results.protocol, results.policy, results.tasks, results.episodes, results.planned)
         return repr(about)
 
-    _told(read)
+    _reported(read)
 
 
 def read_noise(folder: str) -> None:
     from turbopi.cli.files import load_noise
 
-    _told(lambda: load_noise(Path(folder) / "noise.npy"))
+    _reported(lambda: load_noise(Path(folder) / "noise.npy"))
 
 
 def read_robot(folder: str) -> None:
     from turbopi.robots.described import load_robot
 
-    _told(lambda: repr(vars(load_robot(f"{folder}/robot.json"))))
+    _reported(lambda: repr(vars(load_robot(f"{folder}/robot.json"))))
 
 
-def _told(read: Callable[[], Any]) -> None:
-    from turbopi.cli.framework import with_errors_told
+def _reported(read: Callable[[], Any]) -> None:
+    from turbopi.cli.framework import with_errors_reported
 
-    with_errors_told(lambda: print(digest(read()).hex()), debug=False)
+    with_errors_reported(lambda: print(digest(read()).hex()), debug=False)

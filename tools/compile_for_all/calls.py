@@ -1,4 +1,4 @@
-"""Calls of everything that launches a Triton kernel, at the full model's sizes: two pictures and a prompt's bucket."""
+"""Calls of everything that launches a Triton kernel, at the full model's sizes: two images and a prompt's bucket."""
 
 from collections.abc import Callable
 from functools import partial
@@ -67,7 +67,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_batch(target, inverses),
         *_rest(),
         *_backward(),
-        *_way_back(),
+        *_backward_form(),
     ]
     calls += [partial(_geglu, one) for one in inverses]
     return [*calls, *_weights(), *product_calls(target, numbers, chosen)]
@@ -228,13 +228,13 @@ def _rest() -> Calls:
         cos, cache = of(PREFIX, 128, dtype=F32), of(PREFIX, 256)
         return rope.rope_split(of(PREFIX, 2560), cos, cos, cache, cache)
 
-    def pictures(dtype: torch.dtype) -> None:
-        resize.resize_pictures(of(2, len(SOURCE), dtype=torch.int64), of(2, 224, 224, 3, dtype=dtype))
+    def camera_images(dtype: torch.dtype) -> None:
+        resize.resize_images(of(2, len(SOURCE), dtype=torch.int64), of(2, 224, 224, 3, dtype=dtype))
 
     pixels = (torch.uint8, F32)
     return [
         rope_split,
-        *(partial(pictures, dtype) for dtype in pixels),
+        *(partial(camera_images, dtype) for dtype in pixels),
         lambda: transfer.transfer(of(2, 224, 224, 3, dtype=torch.uint8), of(2, 224, 224, 3, dtype=torch.uint8)),
         *(partial(lambda dtype: embedding.patch_rows(of(2, 224, 224, 3, dtype=dtype), 14), dtype) for dtype in pixels),
         lambda: embedding.odd_rows(of(2, 224, 224, 3, dtype=torch.uint8), 14),
@@ -263,7 +263,7 @@ def _backward() -> Calls:
     ]
 
 
-def _way_back() -> Calls:
+def _backward_form() -> Calls:
     """The expert on few tokens: a tile for each power of two of them, with prefixes of one and of four cameras."""
 
     def layer(tokens: int, slots: int, state_token: bool) -> None:

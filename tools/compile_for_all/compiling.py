@@ -113,7 +113,7 @@ def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes
 def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
     """(name, what compiles it): Hopper's for 9.0, and the portable denoising loop of 10 and of 50 actions."""
     if target.capability == HOPPER:
-        yield from ((f"sm90: {name}", make) for name, make in (machine_code.SHAPES | hopper_way_back()).items())
+        yield from ((f"sm90: {name}", make) for name, make in (machine_code.SHAPES | hopper_backward()).items())
     for suffix in (10, 50):
         numbers: tuple[WeightNumbers, ...] = ("bf16", "fp8" if fp8_refusal(target.capability) is None else "int8")
         for weights in numbers:
@@ -121,7 +121,7 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
             yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
 
 
-def hopper_way_back() -> dict[str, Callable[[Path | None], bytes]]:
+def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
     """What the true Jacobian's way back has of its own on Hopper, for 10 actions and for 50.
 
     Products of more tokens than vjp.MOST_TOKENS are Triton's, which are compiled for every target.

@@ -75,8 +75,8 @@ def replaced(before: CompiledForAll, now: CompiledForAll, targets: set[str], onl
     if not any("110" in target for target in targets):
         both -= {"ptxas of 11.0"}
     if other := [name for name in sorted(both) if before.versions[name] != now.versions[name]]:
-        told = ", ".join(f"{name} {before.versions[name]}, here {now.versions[name]}" for name in other)
-        raise ConfigError(f"the result is of other compilers: {told}. Make it anew with --json")
+        reported = ", ".join(f"{name} {before.versions[name]}, here {now.versions[name]}" for name in other)
+        raise ConfigError(f"the result is of other compilers: {reported}. Make it anew with --json")
     order = {row.target: place for place, row in enumerate(reversed(before.rows))}
     kept = [row for row in before.rows if row.target not in targets or only not in row.kernel]
     rows = sorted([*kept, *now.rows], key=lambda row: -order.get(row.target, 0))

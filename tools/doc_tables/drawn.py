@@ -60,8 +60,8 @@ def stale_plots(root: Path) -> list[str]:
             if not path.is_file():
                 found.append(f"{place}: there is no such plot; run scripts/tables")
                 continue
-            with Image.open(path) as picture:
-                drawn_of = picture.info.get(DRAWN_OF)
+            with Image.open(path) as camera_image:
+                drawn_of = camera_image.info.get(DRAWN_OF)
             if drawn_of != fingerprint(document):
                 found.append(f"{place}: drawn of another results.json than the one beside it; run scripts/tables")
     return found

@@ -229,7 +229,7 @@ def attacks(*files: "list[Piece]") -> list[str]:
 
 
 def image_sizes(document: BenchDocument) -> list[str]:
-    """The main job with pictures as cameras send them: the whole call's median, and how much longer than 224 x 224."""
+    """The main job with images as cameras send them: the whole call's median, and how much longer than 224 x 224."""
     main, rows = document.main_job, []
     sizes = list(dict.fromkeys((result.job.image_width, result.job.image_height) for result in document.results))
     for backend, precision in dict.fromkeys((result.backend, result.precision) for result in document.results):

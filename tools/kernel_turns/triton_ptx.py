@@ -82,7 +82,7 @@ class Int8Product(GpuBench):
         exact = activated(kind, self.weight.product(self.x, self.bias))
         self.exact = exact.clamp(-INT8_MAX / INVERSE, INT8_MAX / INVERSE) if one.out_fp8 else exact
         rounded = to_int8(exact, INVERSE) if one.out_fp8 else exact.to(torch.bfloat16)
-        self.twin_error = relative(self.whole(rounded), self.exact)
+        self.reference_error = relative(self.whole(rounded), self.exact)
 
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
         epilogue: tiles.Epilogue = self.operation.operation  # type: ignore[assignment]
@@ -112,8 +112,8 @@ def found_operations(target: Target) -> list[Operation]:
 
 def tiles_of(one: Operation, target: Target) -> list[Knobs]:
     """Every tile that the GPU takes, and not the library."""
-    asked = replace(one, numbers="fp8") if one.numbers == "int8" else one
-    found = portable.candidates(asked, target.capability, MULTIPROCESSORS[target.capability])
+    requested = replace(one, numbers="fp8") if one.numbers == "int8" else one
+    found = portable.candidates(requested, target.capability, MULTIPROCESSORS[target.capability])
     return [knobs for knobs in found if LIBRARY not in knobs]
 
 

@@ -10,22 +10,22 @@ TASK = "pick up the black bowl and put it on the plate"
 
 @dataclass(frozen=True)
 class Seen:
-    """One observation: pictures by camera, as (height, width)."""
+    """One observation: images by camera, as (height, width)."""
 
-    pictures: dict[str, tuple[int, int]]
+    camera_images: dict[str, tuple[int, int]]
     task: str = TASK
     state_dim: int = 8
-    unit: bool = False  # pictures are float32 in [0, 1], not uint8; LeRobot before 0.6 divides these by 255, too
+    unit: bool = False  # images are float32 in [0, 1], not uint8; LeRobot before 0.6 divides these by 255, too
 
     def made(self, seed: int) -> dict[str, np.ndarray]:
-        """LeRobot's keys: [h, w, 3] pictures of a few colours, float32 state, the task as an array of one text."""
+        """LeRobot's keys: [h, w, 3] images of a few colours, float32 state, the task as an array of one text."""
         rng = np.random.default_rng(seed)
         made: dict[str, np.ndarray] = {}
-        for name, (height, width) in self.pictures.items():
+        for name, (height, width) in self.camera_images.items():
             blocks = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
             rows, columns = np.arange(height) * 8 // height, np.arange(width) * 8 // width
-            picture = blocks[rows][:, columns]
-            made[f"observation.images.{name}"] = picture.astype(np.float32) / 255 if self.unit else picture
+            camera_image = blocks[rows][:, columns]
+            made[f"observation.images.{name}"] = camera_image.astype(np.float32) / 255 if self.unit else camera_image
         made["observation.state"] = rng.uniform(-1.3, 1.3, self.state_dim).astype(np.float32)
         made["task"] = np.array([self.task])
         return made

@@ -31,7 +31,7 @@ def edges(checkpoint: Path, inputs: dict[str, np.ndarray]) -> dict[str, Any]:
     arrays = {key: value for key, value in inputs.items() if key.startswith("observation.")}
     batch = pre(prepare_observation_for_inference(arrays, torch.device("cpu"), task=str(inputs["task"])))
     policy = SimpleNamespace(config=config, parameters=lambda: iter([torch.zeros(1)]))
-    pictures, masks = PI05Policy._preprocess_images(policy, batch)
+    camera_images, masks = PI05Policy._preprocess_images(policy, batch)
     tokens, valid = (batch[f"observation.language.{name}"] for name in ("tokens", "attention_mask"))
     if len(tokens) != 1:
         raise ValueError(f"{len(tokens)} prompts came of one")
@@ -39,7 +39,7 @@ def edges(checkpoint: Path, inputs: dict[str, np.ndarray]) -> dict[str, Any]:
     return {
         "tokens": tokens[0][valid[0]],
         "state": batch["observation.state"][0],
-        "images": torch.stack([picture[0].permute(1, 2, 0) for picture in pictures]),
+        "images": torch.stack([camera_image[0].permute(1, 2, 0) for camera_image in camera_images]),
         "image_mask": torch.stack([mask[0] for mask in masks]),
         "actions": post(chunk)[0],
     }

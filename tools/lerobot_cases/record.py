@@ -71,11 +71,13 @@ def record(folder: Path, case: Case) -> None:
 
 
 def _config(case: Case) -> PreTrainedConfig:
-    pictures = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, 480, 640)) for name in case.cameras}
+    camera_images = {
+        f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, 480, 640)) for name in case.cameras
+    }
     state_dim = case.config_state_dim or case.state_dim
     config = CONFIGS[case.kind](
         device="cpu",
-        input_features=pictures | {"observation.state": PolicyFeature(FeatureType.STATE, (state_dim,))},
+        input_features=camera_images | {"observation.state": PolicyFeature(FeatureType.STATE, (state_dim,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (case.action_dim,))},
         **({"chunk_size": 10, "n_action_steps": 10} | case.config),
     )

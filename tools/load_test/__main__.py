@@ -7,7 +7,7 @@
     python -m load_test ws://gpu:8000 --clients 12 --poisson 60            at random
     python -m load_test ws://127.0.0.1:8000 --clients 8 --client bare --processes 1    clients that need few cores
     python -m load_test ws://127.0.0.1:8000 --client openpi --python .venv-openpi-client/bin/python
-    python -m load_test ws://127.0.0.1:8000 --robot droid --pictures 640x480
+    python -m load_test ws://127.0.0.1:8000 --robot droid --images 640x480
     python -m load_test --show eight.json                                  the table of a result
 
 Closed loop: each client sends its next request when it has the answer to the one before. Open loop (--rate, --poisson):
@@ -27,7 +27,7 @@ from pathlib import Path
 from rich.console import Console
 
 from load_test.document import COLUMNS, LoadDocument, read_load, tables
-from load_test.observations import picture_size
+from load_test.observations import image_size
 from load_test.run import Wanted, run
 from turbopi.cli.api_key import chosen_key
 from turbopi.support.errors import TurboPiError
@@ -61,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--python", metavar="FILE", help="the clients' interpreter, such as one with openpi-client")
     parser.add_argument("--robot", help="whose observations: a name or a .json; default: as the server's metadata says")
     parser.add_argument("--observation", type=Path, metavar="FILE", help="or one that was recorded")
-    parser.add_argument("--pictures", metavar="WxH", help="size of all pictures; default: the robot's own")
-    parser.add_argument("--seed", type=int, default=0, help="of pictures and arrivals")
+    parser.add_argument("--images", metavar="WxH", help="size of all images; default: the robot's own")
+    parser.add_argument("--seed", type=int, default=0, help="of images and arrivals")
     parser.add_argument("--api-key-file", type=Path, metavar="FILE", help="its one line is the server's API key")
     given = parser.parse_args(arguments)
     console = Console(width=COLUMNS)
@@ -99,7 +99,7 @@ def _wanted(given: argparse.Namespace) -> Wanted:
         seed=given.seed,
         robot=given.robot,
         observation=given.observation,
-        pictures=None if given.pictures is None else picture_size(given.pictures),
+        camera_images=None if given.camera_images is None else image_size(given.camera_images),
         python=given.python,
     )
 

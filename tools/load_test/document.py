@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 from rich.table import Table
 
 from load_test.schedule import Arrivals, Request
@@ -46,7 +46,7 @@ class Load(Struct, frozen=True, kw_only=True):
     rate        requests a second of all clients together; None in a closed loop
     seconds     that were measured, after `warmup_seconds` that weren't
     robot       whose observations were sent, or the file of one
-    pictures    the shapes of the pictures in one of them
+    images    the shapes of the images in one of them
     message_bytes  of one
     """
 
@@ -60,7 +60,7 @@ class Load(Struct, frozen=True, kw_only=True):
     warmup_seconds: Annotated[float, Meta(ge=0)]
     seed: int
     robot: str
-    pictures: list[tuple[int, int, int]]
+    camera_images: list[tuple[int, int, int]] = field(name="pictures")
     message_bytes: int
 
 
@@ -170,9 +170,9 @@ def tables(document: LoadDocument) -> list[Table | str]:
     """For people: what was asked for, the spreads, and what to know before believing them."""
     load = document.load
     rate = "closed loop" if load.rate is None else f"{load.rate:g} a second, {load.arrivals}"
-    pictures = ", ".join("x".join(map(str, shape)) for shape in load.pictures) or "none"
+    images = ", ".join("x".join(map(str, shape)) for shape in load.camera_images) or "none"
     title = f"{load.clients} {load.client} client{'s' * (load.clients > 1)}, {rate}, {load.seconds:g} s"
-    table = Table("ms", "min", "p50", "p90", "p95", "p99", "max", title=title, caption=f"pictures: {pictures}")
+    table = Table("ms", "min", "p50", "p90", "p95", "p99", "max", title=title, caption=f"images: {images}")
     for column in table.columns[1:]:
         column.justify = "right"
     rows = {

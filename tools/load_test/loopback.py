@@ -49,10 +49,10 @@ def round_trips(request: int, answer: int, work_s: float, count: int) -> list[fl
         connection = socket.create_connection(listener.getsockname()[:2])
     with connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        asked, buffer = bytes(request), memoryview(bytearray(answer))
+        requested, buffer = bytes(request), memoryview(bytearray(answer))
         for i in range(WARM_UP + count):
             start = time.perf_counter()
-            connection.sendall(asked)
+            connection.sendall(requested)
             if not _read(connection, buffer):
                 raise ConnectionError(f"the other process ended after {i} round trips")
             if i >= WARM_UP:
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m load_test.loopback", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--request", type=int, default=301500, metavar="BYTES", help="default: two 224 x 224 pictures")
+    parser.add_argument("--request", type=int, default=301500, metavar="BYTES", help="default: two 224 x 224 images")
     parser.add_argument("--answer", type=int, default=3200, metavar="BYTES", help="default: ten actions")
     parser.add_argument("--work", type=float, default=0.0, metavar="MS", help="that the server sleeps for each request")
     parser.add_argument("--count", type=int, default=1000, metavar="N")

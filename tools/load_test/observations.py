@@ -1,4 +1,4 @@
-"""What the clients send: observations of a robot, with other pictures for each client and call."""
+"""What the clients send: observations of a robot, with other images for each client and call."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,31 +10,31 @@ from turbopi.recordings import load_observation
 from turbopi.robots import create_robot
 from turbopi.support.errors import ConfigError
 
-OF_A_CLIENT = 4  # in turns, so that no picture is the one before: a backend may not copy that again
+OF_A_CLIENT = 4  # in turns, so that no image is the one before: a backend may not copy that again
 
 
-def picture_size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
     """(height, width) of "640x480". Raises ConfigError."""
     width, _, height = text.partition("x")
     if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
-        raise ConfigError(f"--pictures {text}: expected WIDTHxHEIGHT, such as 640x480")
+        raise ConfigError(f"--images {text}: expected WIDTHxHEIGHT, such as 640x480")
     if not (0 < int(width) <= 8192 and 0 < int(height) <= 8192):
-        raise ConfigError(f"--pictures {text}: expected 1 to 8192 pixels each way")
+        raise ConfigError(f"--images {text}: expected 1 to 8192 pixels each way")
     return int(height), int(width)
 
 
-def is_picture(value: object) -> bool:
+def is_image(value: object) -> bool:
     return isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.ndim == 3 and 3 in value.shape
 
 
-def with_new_pictures(value: Any, size: tuple[int, int] | None, rng: np.random.Generator) -> Any:
-    """An observation, or a part of it, with pictures of random pixels in the same layout, [h, w, 3] or [3, h, w].
+def with_new_images(value: Any, size: tuple[int, int] | None, rng: np.random.Generator) -> Any:
+    """An observation, or a part of it, with images of random pixels in the same layout, [h, w, 3] or [3, h, w].
 
     size  height and width of each; None: as they are
     """
     if isinstance(value, Mapping):
-        return {key: with_new_pictures(item, size, rng) for key, item in value.items()}
-    if not is_picture(value):
+        return {key: with_new_images(item, size, rng) for key, item in value.items()}
+    if not is_image(value):
         return value
     shape = value.shape
     if size is not None:
@@ -43,10 +43,10 @@ def with_new_pictures(value: Any, size: tuple[int, int] | None, rng: np.random.G
 
 
 def shapes(value: Any) -> list[tuple[int, ...]]:
-    """Of all pictures of an observation."""
+    """Of all images of an observation."""
     if isinstance(value, Mapping):
         return [shape for item in value.values() for shape in shapes(item)]
-    return [value.shape] if is_picture(value) else []
+    return [value.shape] if is_image(value) else []
 
 
 def observations(
@@ -65,7 +65,7 @@ def observations(
     else:
         assert robot is not None
         name, own = robot, create_robot(robot).example(rng)
-    made = [[with_new_pictures(own, size, rng) for _ in range(OF_A_CLIENT)] for _ in range(clients)]
+    made = [[with_new_images(own, size, rng) for _ in range(OF_A_CLIENT)] for _ in range(clients)]
     if size is not None and not shapes(own):
-        raise ConfigError(f"--pictures: the observations of {name} have no uint8 pictures [h, w, 3] or [3, h, w]")
+        raise ConfigError(f"--images: the observations of {name} have no uint8 images [h, w, 3] or [3, h, w]")
     return name, made

@@ -37,7 +37,7 @@ class Wanted:
     drain_s       seconds after the end in which requests that were due are still sent
     robot         a name or a .json; None: the one that the server's metadata names
     observation   instead, the file or folder of one
-    pictures      height and width of all pictures; None: the robot's own
+    images      height and width of all images; None: the robot's own
     python        the interpreter of the clients; None: this one
     """
 
@@ -55,7 +55,7 @@ class Wanted:
     seed: int = 0
     robot: str | None = None
     observation: Path | None = None
-    pictures: tuple[int, int] | None = None
+    camera_images: tuple[int, int] | None = None
     python: str | None = None
 
     def check(self) -> None:
@@ -137,7 +137,7 @@ def run(wanted: Wanted, command: Sequence[str]) -> LoadDocument:
     robot = wanted.robot or server.get("robot")
     if wanted.observation is None and not isinstance(robot, str):
         raise ConfigError("the server's metadata names no robot: say with --robot or --observation what to send")
-    name, made = observations(robot, wanted.observation, wanted.pictures, wanted.clients, wanted.seed)
+    name, made = observations(robot, wanted.observation, wanted.camera_images, wanted.clients, wanted.seed)
     count = wanted.processes or wanted.clients
     with tempfile.TemporaryDirectory() as text, ExitStack() as stack:
         folder = Path(text)
@@ -172,7 +172,7 @@ def run(wanted: Wanted, command: Sequence[str]) -> LoadDocument:
         warmup_seconds=wanted.warmup,
         seed=wanted.seed,
         robot=name,
-        pictures=[(int(a), int(b), int(c)) for a, b, c in shapes(made[0][0])],
+        camera_images=[(int(a), int(b), int(c)) for a, b, c in shapes(made[0][0])],
         message_bytes=len(pack(made[0][0])),
     )
     fields = summary([by_client[client] for client in sorted(by_client)], load)

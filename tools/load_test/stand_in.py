@@ -26,7 +26,7 @@ from turbopi.engine.plan import split
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 
-# Milliseconds of vision, prefix and denoising of a call for so many observations of two pictures, and what `fused`
+# Milliseconds of vision, prefix and denoising of a call for so many observations of two images, and what `fused`
 # splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.
 GPUS: dict[str, tuple[dict[int, tuple[float, float, float]], dict[int, float]]] = {
     "h100_bf16": (
@@ -69,7 +69,7 @@ class SleepingBackend(Backend):
         self.stages, self.costs = GPUS[self.gpu]
         self._device = Device()
         side = config.vision.image_size
-        self._pictures = np.zeros((4 * max(self.stages), side, side, 3), np.uint8)
+        self._images = np.zeros((4 * max(self.stages), side, side, 3), np.uint8)
         self._inputs = np.zeros((max(self.stages), config.action_horizon, config.action_dim), np.float32)
 
     @property
@@ -99,9 +99,9 @@ class SleepingBackend(Backend):
             rows = rows[bucket:]
         return BegunBatch(self._begin_call, calls, images)
 
-    def _begin_call(self, bucket: int, pictures: Sequence[Sequence[np.ndarray]]) -> Finish:
-        self._see(bucket, pictures)
-        cameras = [len(one) for one in pictures]
+    def _begin_call(self, bucket: int, camera_images: Sequence[Sequence[np.ndarray]]) -> Finish:
+        self._see(bucket, camera_images)
+        cameras = [len(one) for one in camera_images]
 
         def finish(
             tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, conditionings: Rows
@@ -110,9 +110,11 @@ class SleepingBackend(Backend):
 
         return finish
 
-    def _see(self, bucket: int, pictures: Sequence[Sequence[np.ndarray]]) -> None:
-        for place, picture in zip(self._pictures, (picture for one in pictures for picture in one), strict=False):
-            place[:] = picture
+    def _see(self, bucket: int, camera_images: Sequence[Sequence[np.ndarray]]) -> None:
+        for place, camera_image in zip(
+            self._images, (camera_image for one in camera_images for camera_image in one), strict=False
+        ):
+            place[:] = camera_image
         self._device.launch(self.stages[bucket][0])
 
     def finish(

@@ -139,7 +139,7 @@ FAULTS = (
         "turbopi.backends",
         "cameras = min(max(shape.cameras, 3), MAX_CAMERAS)",
         "cameras = min(max(shape.cameras, 3), 3)",
-        "keys of the fourth picture are written beyond the buffer",
+        "keys of the fourth image are written beyond the buffer",
         (CHOICE,),
     ),
     Fault(
@@ -355,7 +355,7 @@ FAULTS = (
         "turbopi.kernels",
         "logits.view(-1, heads, len(k)).masked_fill_(hidden, -torch.inf)",
         "pass",
-        "one robot's pictures move another one's arm",
+        "one robot's images move another one's arm",
         CONDITIONED_BATCH,
     ),
     Fault(

@@ -44,9 +44,9 @@ def test_a_certificate_is_condensed_to_the_worst_of_every_name() -> None:
 
 def test_varied_observations_are_no_two_alike_and_come_again() -> None:
     first, again, other = (list(certificates.varied(seed, 8)) for seed in (0, 0, 1))
-    pictures = [np.asarray(one["observation/image"]).tobytes() for one in (*first, *other)]
-    assert len(set(pictures)) == 16
-    assert [np.asarray(one["observation/image"]).tobytes() for one in again] == pictures[:8]
+    camera_images = [np.asarray(one["observation/image"]).tobytes() for one in (*first, *other)]
+    assert len(set(camera_images)) == 16
+    assert [np.asarray(one["observation/image"]).tobytes() for one in again] == camera_images[:8]
     policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu")
     assert policy.prepare(first[7]).token_mask.any()
 

@@ -62,10 +62,10 @@ def test_a_student_learns_its_recipes_targets(
     recipe: Any, teacher: Pi0Model, ways: Ways, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At noise x − v is compared with the pair's actions, another noise's, or the mean; on the way with the pair's."""
-    asked: list[tuple[torch.Tensor, torch.Tensor]] = []
+    requested: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def exact(model: Any, k: torch.Tensor, v: torch.Tensor, x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        asked.append((x, t))
+        requested.append((x, t))
         reached = torch.stack([_target(ways, recipe, one, float(time)) for one, time in zip(x, t, strict=True)])
         return ((x - reached) / t[:, None, None]).requires_grad_()
 
@@ -74,7 +74,7 @@ def test_a_student_learns_its_recipes_targets(
     monkeypatch.setattr(student, "_learn", lambda loss, progress: None)
     torch.manual_seed(1)
     assert student.step(ways, 0.0) == pytest.approx(0, abs=1e-9)
-    times = asked[0][1]
+    times = requested[0][1]
     assert (times[:4] == 1).all() and (times[4:] < 1).all()
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import pytest
 
 from turbopi.evaluate.motion import Motion
-from turbopi.evaluate.results import Episode, PolicyTold, Results
+from turbopi.evaluate.results import Episode, PolicyDescription, Results
 from turbopi.sim.base import Task
 from turbopi_lab.small_policy.card import write_card
 from turbopi_lab.small_policy.judged import DELAYED, PLAIN, delayed_table, judge, load_judged, table, write_judged
@@ -16,7 +16,7 @@ MOTION = Motion(seams=3, seam_jump=0.25, seam_gap=0.1, step_jump=0.05, jerk=0.1,
 
 def run(folder: Path, solved: str, *, weights: str = "w", **protocol: Any) -> Path:
     """solved: for the initial states from 30 on, 1 or 0."""
-    policy = PolicyTold("fused bf16", {"weights": weights}, {"device_name": "a GPU"})
+    policy = PolicyDescription("fused bf16", {"weights": weights}, {"device_name": "a GPU"})
     tasks = [Task(0, "pick", "pick it up", 50, 220)]
     results = Results(folder, {"suite": "libero_spatial", **protocol}, policy, tasks, {"torch": "2"}, {})
     results.planned = {(0, 30 + place) for place in range(len(solved))}

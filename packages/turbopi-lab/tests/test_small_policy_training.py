@@ -148,9 +148,9 @@ def test_the_dynamic_tasks_frames_begin_with_what_is_on_its_way() -> None:
     rows = np.random.default_rng(0).integers(0, 99, 3)
     world = Chase.start([np.random.default_rng(row) for row in rows])
     places = torch.from_numpy(np.stack((world.target, world.before[:, 0], world.tip), axis=1)).float()
-    pictures = chase.Frames(places, torch.zeros(3, 1, 2), torch.zeros(3)).pictures(48)
+    camera_images = chase.Frames(places, torch.zeros(3, 1, 2), torch.zeros(3)).camera_images(48)
     as_drawn = torch.from_numpy(world.draw(48)).float() / 255 * 2 - 1
-    torch.testing.assert_close(pictures, as_drawn, rtol=0, atol=0.6 / 255 * 2)
+    torch.testing.assert_close(camera_images, as_drawn, rtol=0, atol=0.6 / 255 * 2)
 
 
 def test_the_time_embedding_is_the_models() -> None:
@@ -189,7 +189,7 @@ def test_a_few_steps_on_a_few_frames_lower_the_loss_and_the_export_is_what_was_t
     batch = memory.batch(torch.arange(2))
     losses = []
     for _ in range(12):
-        torch.manual_seed(1)  # the same noise, times and changes of the pictures: only learning is left
+        torch.manual_seed(1)  # the same noise, times and changes of the images: only learning is left
         losses.append(float(trainer.step(batch, 0.0)["flow"]))
     assert losses[-1] < 0.9 * losses[0]
 
@@ -270,11 +270,11 @@ class CountingWorld:
     """A scene in which nothing happens but steps."""
 
     def __init__(self) -> None:
-        self._pictures: dict[str, Any] = {"drawn": True}
-        self.asked_to_look: list[bool] = []
+        self._images: dict[str, Any] = {"drawn": True}
+        self.requested_to_look: list[bool] = []
 
     def step(self, action: np.ndarray, look: bool) -> bool:
-        self.asked_to_look.append(look)
+        self.requested_to_look.append(look)
         return False
 
 
@@ -283,11 +283,11 @@ def test_a_late_chunk_of_the_learner_takes_over_where_what_it_was_told_to_hold_e
     delay: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chunk k is k * 100 + its row. What is held goes on from the chunk before."""
-    told: list[list[float]] = []
+    reported: list[list[float]] = []
 
-    def ask(pictures: Any, prompt: int, held: np.ndarray) -> np.ndarray:
-        told.append(held[:, 0].tolist())
-        return np.repeat(np.arange(HORIZON)[:, None] + 100.0 * (len(told) - 1), 7, axis=1)
+    def ask(camera_images: Any, prompt: int, held: np.ndarray) -> np.ndarray:
+        reported.append(held[:, 0].tolist())
+        return np.repeat(np.arange(HORIZON)[:, None] + 100.0 * (len(reported) - 1), 7, axis=1)
 
     player = Player.__new__(Player)
     player.ask, player.draws, player.episode = ask, True, Episode(Setting(0, 0))
@@ -296,29 +296,33 @@ def test_a_late_chunk_of_the_learner_takes_over_where_what_it_was_told_to_hold_e
     sight = Sight(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3), opening=0.0, held=False)
     monkeypatch.setattr(player.expert, "look", lambda: sight)
     monkeypatch.setattr(player.expert, "act", lambda seen: np.zeros(7))
-    monkeypatch.setattr(player, "_pictures", lambda: np.zeros(0))
+    monkeypatch.setattr(player, "_images", lambda: np.zeros(0))
     kept: list[int] = []
     monkeypatch.setattr(player, "_keep_frame", lambda seen, lead: kept.append(len(player.episode.labels)))
     player._let_learner(3 * REPLAN, delay, lead=2)
     driven = [float(action[0]) for action in player.episode.executed]
     if delay == 0:
-        assert driven == [*range(5), *range(100, 105), *range(200, 205)] and told == [[], [], []]
+        assert driven == [*range(5), *range(100, 105), *range(200, 205)] and reported == [[], [], []]
     else:
-        assert driven == [*range(8), *range(103, 108), *range(203, 205)] and told == [[], [5, 6, 7], [105, 106, 107]]
+        assert driven == [*range(8), *range(103, 108), *range(203, 205)] and reported == [
+            [],
+            [5, 6, 7],
+            [105, 106, 107],
+        ]
     assert kept == [3 * REPLAN - 2]  # where what is left of the learner's steps is the lead
-    assert [step for step, look in enumerate(world.asked_to_look, start=1) if look] == [5, 10, 13, 15]
+    assert [step for step, look in enumerate(world.requested_to_look, start=1) if look] == [5, 10, 13, 15]
 
 
 def test_what_an_actor_is_told_to_hold_begins_its_chunk_and_changes_the_rest() -> None:
     torch.manual_seed(0)
     actor = Actor(CONFIG.model, 2, *prompt_table(), torch.device("cpu"))
     actor.take(lively_model().state_dict())
-    pictures = np.random.default_rng(0).integers(0, 256, (2, 2, 224, 224, 3), np.uint8)
+    camera_images = np.random.default_rng(0).integers(0, 256, (2, 2, 224, 224, 3), np.uint8)
     held = np.random.default_rng(1).uniform(-1, 1, (4, 7))
     torch.manual_seed(1)
-    free = actor.act(pictures, [2, 2])
+    free = actor.act(camera_images, [2, 2])
     torch.manual_seed(1)
-    found = actor.act(pictures, [2, 2], [held, held[:0]])
+    found = actor.act(camera_images, [2, 2], [held, held[:0]])
     np.testing.assert_array_equal(found[0, :4, :7], held.astype(np.float32))
     np.testing.assert_array_equal(found[0, :4, 7:], 0)
     assert np.abs(found[0, 4:] - free[0, 4:]).max() > 1e-3

@@ -173,8 +173,8 @@ def test_plots_show_intervals(drawn: list[Figure], tmp_path: Path) -> None:
 def test_no_cell_asks_for_a_velocity_at_the_end_where_none_was_trained() -> None:
     cells = [way for way in solvers.ways(small=False) if way.grid != "learned"]
     for way in cells:
-        asked = solvers.integration(way.solver, solvers.grid_times(way, {}), way.evaluations)
-        assert min(asked.evaluated) >= 0.03 and len(asked.evaluated) == way.evaluations, way
+        requested = solvers.integration(way.solver, solvers.grid_times(way, {}), way.evaluations)
+        assert min(requested.evaluated) >= 0.03 and len(requested.evaluated) == way.evaluations, way
     assert len({*cells}) == len(cells)
 
 
@@ -185,10 +185,10 @@ def test_a_way_is_what_the_policys_options_of_the_same_names_are() -> None:
         (solvers.Way("exponential", "uniform", 3), "uniform"),
         (solvers.Way("ab2", "shifted to actions", 3), "shifted_to_actions"),
     ):
-        asked = Denoising(3).changed(3, way.solver, grid, ConfigError).integration  # type: ignore[arg-type]
+        requested = Denoising(3).changed(3, way.solver, grid, ConfigError).integration  # type: ignore[arg-type]
 
-        def by_option(call: Call, asked: Any = asked) -> Tensor:
-            conditioning = Conditioning(integration=asked)
+        def by_option(call: Call, requested: Any = requested) -> Tensor:
+            conditioning = Conditioning(integration=requested)
             return product.backend.sample(call.observation, call.noise, 3, conditioning=conditioning).actions
 
         one, other = (play(policy, episodes, actor).paths for actor in (steps.actor(policy, way, {}), by_option))
@@ -222,23 +222,23 @@ def test_cells_are_paired_episode_by_episode() -> None:
         play(policy, episodes, still)
         return np.asarray(seen[0].observation.images), seen[2].noise
 
-    (few_pictures, few_noise), (pictures, noise) = starts(range(2, 4)), starts(range(5))
-    assert np.array_equal(few_pictures, pictures[2:4]) and torch.equal(few_noise, noise[2:4])
+    (few_images, few_noise), (camera_images, noise) = starts(range(2, 4)), starts(range(5))
+    assert np.array_equal(few_images, camera_images[2:4]) and torch.equal(few_noise, noise[2:4])
     assert not torch.equal(noise[0], noise[1])
 
 
 def test_decided_episodes_end_alike_whether_the_policy_is_still_asked_for_them() -> None:
     policy, episodes = open_policy("chase"), range(12)
-    asked: list[int] = []
+    requested: list[int] = []
 
     def counting(call: Call) -> Tensor:
-        asked.append(len(call.episodes))
+        requested.append(len(call.episodes))
         return sampled(policy.model, 3)(call)
 
     few = play(policy, episodes, counting)
     everyone = play(policy, episodes, sampled(policy.model, 3), everyone=True)
     assert np.array_equal(few.solved, everyone.solved) and np.array_equal(few.touched, everyone.touched)
-    assert asked[0] == 12 and asked == sorted(asked, reverse=True) and asked[-1] < 6
+    assert requested[0] == 12 and requested == sorted(requested, reverse=True) and requested[-1] < 6
 
 
 def test_the_shipped_chase_policy_solves_what_chance_doesnt() -> None:
@@ -411,19 +411,19 @@ def test_four_bits_are_gone_after_the_block_and_activations_are_rounded_where_th
 
 def test_weights_are_rounded_once_for_all_formats_that_share_the_rounding_and_only_those_are_held() -> None:
     held = fp8_and_fp4.HeldWeights()
-    asked: list[Directions | None] = []
+    requested: list[Directions | None] = []
     weight, site = torch.nn.Parameter(torch.ones(2, 32)), Site("expert", 0, "qkv", 32, 2)
 
     def rounding(weight: Tensor, directions: Directions | None) -> Tensor:
-        asked.append(directions)
+        requested.append(directions)
         return weight.detach() * 2
 
     first = held.rounded(weight, site, rounding, None)
-    assert held.rounded(weight, site, rounding, None) is first and len(asked) == 1
+    assert held.rounded(weight, site, rounding, None) is first and len(requested) == 1
     directions = Directions(torch.ones(32, 1), torch.ones(1), 0.1)
     common = {site: directions}
-    assert held.rounded(weight, site, rounding, common) is not first and asked[-1] is directions
-    assert held.rounded(weight, site, rounding, None) is not first and len(asked) == 3
+    assert held.rounded(weight, site, rounding, common) is not first and requested[-1] is directions
+    assert held.rounded(weight, site, rounding, None) is not first and len(requested) == 3
 
 
 def test_fewer_bits_are_read_sooner() -> None:

@@ -128,24 +128,24 @@ def test_what_a_study_in_a_simulator_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("simulator", "small", "asked", "episodes", "states"),
+    ("simulator", "small", "requested", "episodes", "states"),
     [
         *(("chase", False, None, 200, 200), ("chase", True, None, 2, 2), ("chase", True, 5, 5, 5)),
         *(("reacher", False, None, 150, 50), ("reacher", False, 7, 9, 3)),  # three tasks of fifty initial states each
     ],
 )
 def test_a_cell_has_as_many_episodes_as_were_asked_for(
-    simulator: str, small: bool, asked: int | None, episodes: int, states: int, tmp_path: Path
+    simulator: str, small: bool, requested: int | None, episodes: int, states: int, tmp_path: Path
 ) -> None:
-    setup = Setup(small=small, simulator=simulator, episodes=asked, folder=tmp_path)
+    setup = Setup(small=small, simulator=simulator, episodes=requested, folder=tmp_path)
     jobs = Running.of(setup).jobs
     assert len(jobs) == episodes and {job.initial_state for job in jobs} == set(range(states))
 
 
-@pytest.mark.parametrize(("asked", "states"), [(None, 20), (200, 20), (50, 5), (41, 5)])
-def test_liberos_cells_are_of_states_that_training_never_saw(asked: int | None, states: int) -> None:
+@pytest.mark.parametrize(("requested", "states"), [(None, 20), (200, 20), (50, 5), (41, 5)])
+def test_liberos_cells_are_of_states_that_training_never_saw(requested: int | None, states: int) -> None:
     tasks = [Task(i, "task", "do it", 50, 220) for i in range(10)]
-    assert _initial_states(Setup(episodes=asked), tasks) == range(30, 30 + states)
+    assert _initial_states(Setup(episodes=requested), tasks) == range(30, 30 + states)
     with pytest.raises(ConfigError, match="--episodes is 201; a cell on libero has 200 at most"):
         _initial_states(Setup(episodes=201), tasks)
 
@@ -191,7 +191,7 @@ def test_a_full_report_is_sound_only_with_a_broken_cell_that_fails(
 def test_a_cell_that_does_not_tell_what_it_reused_has_no_place_in_the_plot() -> None:
     study, paired = kv_reuse_libero.VARIANTS, Paired(180, 0, 20, 0).document
     shares = {PLAIN: {}, "full 0.9": {"tokens reused, %": 40.0}, "full 0.87": {}, "patch 0.9": {}}
-    cells = [SimulatorCell(way, Rate(180, 200).document, paired, told) for way, told in shares.items()]
+    cells = [SimulatorCell(way, Rate(180, 200).document, paired, reported) for way, reported in shares.items()]
     (panel,) = study._plot(cells).panels
     assert {series.label: series.x for series in panel.series} == {PLAIN: [0], "full": [40.0]}
 
@@ -262,10 +262,13 @@ def test_slots_that_are_masked_alone_make_the_unmasked_cache_another() -> None:
 
 def test_padding_is_what_the_policys_own_pipeline_adds() -> None:
     policy, world = open_policy("chase"), CHASE.start([(7, 0)])
-    pictures = world.draw(policy.config.model.vision.image_size)[0]
+    camera_images = world.draw(policy.config.model.vision.image_size)[0]
     keys = ("observation/image", "observation/wrist_image")
     product = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
-    given = dict(zip(keys, pictures, strict=True)) | {"observation/state": np.zeros(8), "prompt": CHASE.instruction}
+    given = dict(zip(keys, camera_images, strict=True)) | {
+        "observation/state": np.zeros(8),
+        "prompt": CHASE.instruction,
+    }
     served, ours = Observation.stack([product.prepare(given)]), mask.padded_as_served(policy, policy.observe(world))
     for name in ("images", "image_mask", "tokens", "token_mask"):
         assert torch.equal(getattr(served, name), getattr(ours, name)), name

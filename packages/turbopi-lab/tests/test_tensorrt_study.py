@@ -11,7 +11,7 @@ import pytest
 import torch
 from cli_helpers import refusal, turbopi
 from conftest import golden_cases, golden_model
-from tensorrt_fakes import Twin
+from tensorrt_fakes import Reference
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
@@ -38,7 +38,7 @@ def finite(value: float | None) -> float:
 
 
 def test_each_style_shows_its_own_rounding() -> None:
-    results = attention_study(golden_model("pi05"), *one(), 3, Twin)
+    results = attention_study(golden_model("pi05"), *one(), 3, Reference)
     errors = {(r.attention, r.precision): r for r in results}
     assert len(errors) == 6
     for attention in ("fused", "written out"):

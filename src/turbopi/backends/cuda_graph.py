@@ -1,4 +1,4 @@
-"""Backend `cuda_graph`: a call is a `Graph` for pictures and one for all the rest, with stock PyTorch.
+"""Backend `cuda_graph`: a call is a `Graph` for images and one for all the rest, with stock PyTorch.
 
 Which graphs there are: engine/plan.py; capture and replay: engine/runner.py; of batches: engine/batch_runner.py.
 """

@@ -71,7 +71,7 @@ def bench_policy(
 
 
 def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None = None) -> Job:
-    """The robot's example: its cameras, prompt tokens and first picture's size. The checkpoint's horizon and steps."""
+    """The robot's example: its cameras, prompt tokens and first image's size. The checkpoint's horizon and steps."""
     found = load_tokenizer(
         TINY_TOKENIZER if tokenizer is None and checkpoint.format == "random" else tokenizer,
         checkpoint_dir=checkpoint.path,
@@ -82,7 +82,7 @@ def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, found, robot=robot)
     one, config = pipeline.see(pipeline.example(), resize=False), checkpoint.config
     pipeline.read(one)
-    width, height = one.pictures[0].shape[1::-1] if one.pictures else MODEL_SIZE
+    width, height = one.camera_images[0].shape[1::-1] if one.camera_images else MODEL_SIZE
     tokens = int(one.token_mask.sum())
     return Job(
         int(one.image_mask.sum()), tokens, config.model.action_horizon, config.num_denoising_steps, width, height
@@ -111,7 +111,7 @@ def conditioning(policy: UnifiedPolicy, job: Job) -> Conditioning | None:
 
 
 class Observations:
-    """Random observations of a job: another picture, state and prompt each time, the same ones for the same seed.
+    """Random observations of a job: another image, state and prompt each time, the same ones for the same seed.
 
     For a robot other than `plain` they are that robot's examples, which all have its one prompt.
     """
@@ -139,8 +139,8 @@ class Observations:
         return self._observation(self._prompts[self._next % PROMPTS])
 
     def _observation(self, prompt: str) -> dict[str, Any]:
-        pictures = {camera: self._rng.integers(0, 256, self._size, dtype=np.uint8) for camera in self._cameras}
-        return {"images": pictures, "state": self._rng.uniform(-1, 1, 7), "prompt": prompt}
+        camera_images = {camera: self._rng.integers(0, 256, self._size, dtype=np.uint8) for camera in self._cameras}
+        return {"images": camera_images, "state": self._rng.uniform(-1, 1, 7), "prompt": prompt}
 
     def _prompt(self, tokens: int) -> str:
         """A random prompt of exactly that many tokens; `bench_policy` keeps the state out of it."""
@@ -178,16 +178,16 @@ class Latency:
 
 
 def call(
-    policy: UnifiedPolicy, job: Job, observations: Observations, asked: Conditioning | None = None
+    policy: UnifiedPolicy, job: Job, observations: Observations, requested: Conditioning | None = None
 ) -> dict[str, float]:
     """The times of one call with new observations: of a batch all of it. `asked` is `conditioning(policy, job)`."""
-    if asked is None:
-        asked = conditioning(policy, job)
+    if requested is None:
+        requested = conditioning(policy, job)
     if job.batch > 1:
         batch = [next(observations) for _ in range(job.batch)]
-        joins = None if asked is None else [asked] * job.batch
+        joins = None if requested is None else [requested] * job.batch
         return dict(policy.infer_batch(batch, num_steps=job.steps, conditioning=joins)[0]["policy_timing"])
-    return dict(policy.infer(next(observations), num_steps=job.steps, conditioning=asked)["policy_timing"])
+    return dict(policy.infer(next(observations), num_steps=job.steps, conditioning=requested)["policy_timing"])
 
 
 def measure_calls(
@@ -205,15 +205,15 @@ def measure_calls(
     """
     observations = Observations(policy, job, seed)
     timings: dict[str, list[float]] = {}
-    asked = conditioning(policy, job)
+    requested = conditioning(policy, job)
     for _ in range(WARMING):
-        call(policy, job, observations, asked)
+        call(policy, job, observations, requested)
         advance()
     end = time.perf_counter() + seconds
     for i in range(calls):
         if i >= FEWEST and time.perf_counter() > end:
             break
-        timing = call(policy, job, observations, asked)
+        timing = call(policy, job, observations, requested)
         stages = [timing[f"{stage}_ms"] for stage in ("vision", "prefix", "denoise") if f"{stage}_ms" in timing]
         if stages:
             timing["device_ms"] = sum(stages)
@@ -230,8 +230,8 @@ def answers(policy: UnifiedPolicy, job: Job, *, observations: int = 4) -> np.nda
     chunks = []
     for seed in range(observations):
         noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
-        asked = conditioning(policy, job)
-        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps, conditioning=asked)["actions"])
+        requested = conditioning(policy, job)
+        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps, conditioning=requested)["actions"])
     return np.stack(chunks)
 
 

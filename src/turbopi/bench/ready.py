@@ -64,7 +64,7 @@ def measure_ready(start: Start) -> Ready:
     return Ready(start.backend, start.precision, cold=_run(start), cached=_run(start))
 
 
-class _Told(Struct, frozen=True):
+class _Reported(Struct, frozen=True):
     """What the process says: seconds, the moment of its answer, and bytes."""
 
     load: float
@@ -82,13 +82,13 @@ def _run(start: Start) -> ReadyTimes:
         raise BackendError(f"{start.backend} wasn't ready after {_TIMEOUT} s") from None
     if done.returncode != 0:
         raise BackendError(f"{start.backend} didn't start:\n{done.stderr[-2000:]}")
-    told = msgspec.json.decode(done.stdout.splitlines()[-1], type=_Told)
-    ready = told.at - began
+    reported = msgspec.json.decode(done.stdout.splitlines()[-1], type=_Reported)
+    ready = reported.at - began
     return ReadyTimes(
-        imports=round(ready - told.load - told.warmup, 2),
-        load=told.load,
-        warmup=told.warmup,
-        device_reserved=told.device_reserved,
+        imports=round(ready - reported.load - reported.warmup, 2),
+        load=reported.load,
+        warmup=reported.warmup,
+        device_reserved=reported.device_reserved,
         ready=round(ready, 2),
     )
 
@@ -119,7 +119,7 @@ def _main(start: Start) -> None:
     load = time.perf_counter() - begin
     warmup = policy.warmup()  # ends with an answer
     at, reserved = time.time(), torch.cuda.max_memory_reserved() if torch.cuda.is_available() else None
-    print(msgspec.json.encode(_Told(round(load, 2), round(warmup, 2), at, reserved)).decode())
+    print(msgspec.json.encode(_Reported(round(load, 2), round(warmup, 2), at, reserved)).decode())
 
 
 if __name__ == "__main__":

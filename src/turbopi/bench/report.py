@@ -36,7 +36,7 @@ def report(document: BenchDocument) -> str:
         f"# {document.model} on {about.device_name}",
         "",
         f"{about.date}, commit {about.commit}, torch {about.torch}, Python {about.python}; weights: "
-        f"{document.weights}. Milliseconds; every call has new pictures, prompt, state and noise."
+        f"{document.weights}. Milliseconds; every call has new images, prompt, state and noise."
         + (f" Solver {document.solver}." if document.solver else "")
         + (f" Time grid {document.time_grid}." if document.time_grid else ""),
         "",
@@ -90,14 +90,14 @@ def _main(document: BenchDocument) -> list[str]:
 
 def _clocks(document: BenchDocument) -> list[str]:
     """What the multiprocessors' clock was inside the last denoising kernel of each shape, if they told."""
-    told = [
+    reported = [
         f"{label(result)} {', '.join(f'{clock} ({shape})' for shape, clock in clocks.items())}"
         for result in document.results
         if isinstance(clocks := (result.backend_details or {}).get("denoising_clock_mhz"), Mapping) and clocks
     ]
     gpu = document.provenance.gpu
     said = (gpu.clock_sm if gpu else None) or "nothing"
-    return [f"Clock while denoising, MHz: {'; '.join(told)}. nvidia-smi said {said}.", ""] if told else []
+    return [f"Clock while denoising, MHz: {'; '.join(reported)}. nvidia-smi said {said}.", ""] if reported else []
 
 
 def _all(document: BenchDocument) -> list[str]:

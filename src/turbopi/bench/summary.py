@@ -10,7 +10,7 @@ _Key = tuple[str, str, int, int, int]
 
 
 def linear_models(results: Sequence[Result]) -> list[Line]:
-    """A line for all jobs that differ in steps alone, with pictures of the model's size, one observation a call."""
+    """A line for all jobs that differ in steps alone, with images of the model's size, one observation a call."""
     groups: dict[_Key, dict[int, float]] = {}
     for result in results:
         job = result.job

@@ -19,7 +19,7 @@ JOINS: dict[Join, str] = {  # how a chunk joins a running one (docs/real_time.md
     "identity": "guided by the identity",
     "jacobian": "guided by the Jacobian",
 }
-MODEL_SIZE = (224, 224)  # width and height of the pictures that the model reads
+MODEL_SIZE = (224, 224)  # width and height of the images that the model reads
 
 
 def _written(usual: int) -> int:
@@ -40,9 +40,9 @@ class Job(Struct, frozen=True, omit_defaults=True):
     batch: _Count = 1  # observations of one call; not in files where it is 1
 
     def __str__(self) -> str:
-        pictures = f"{self.cameras} cameras{self.of_size}"
+        images = f"{self.cameras} cameras{self.of_size}"
         return (
-            f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}{self.of_batch}, {self.steps} steps{self.joined}"
+            f"{images}, {self.prompt_tokens} tokens, H={self.horizon}{self.of_batch}, {self.steps} steps{self.joined}"
         )
 
     @property
@@ -57,7 +57,7 @@ class Job(Struct, frozen=True, omit_defaults=True):
 
     @property
     def of_size(self) -> str:
-        """`of 640x480` behind a space, where pictures have another size than the model's; else nothing."""
+        """`of 640x480` behind a space, where images have another size than the model's; else nothing."""
         usual = (self.image_width, self.image_height) == MODEL_SIZE
         return "" if usual else f" of {self.image_width}x{self.image_height}"
 
@@ -94,7 +94,7 @@ def _vision(config: ModelConfig, tokens: int, rows: int, value: int) -> Work:
     v = config.vision
     block = 4 * v.width**2 + 2 * v.width * v.mlp_dim
     weights = v.depth * block + 3 * v.patch_size**2 * v.width + v.width * config.vlm.width
-    attention = v.depth * 4 * tokens * v.num_tokens * v.width  # q kᵀ and p v, within one picture
+    attention = v.depth * 4 * tokens * v.num_tokens * v.width  # q kᵀ and p v, within one image
     return Work(rows * (2 * tokens * weights + attention), weights * value)
 
 

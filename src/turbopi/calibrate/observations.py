@@ -16,7 +16,7 @@ from turbopi.recordings import load_observation
 from turbopi.recordings.sources import chosen_files, spread
 from turbopi.support.errors import ConfigError, ObservationError
 
-LIBERO = "the LIBERO pictures that come with Turbo-Pi"
+LIBERO = "the LIBERO images that come with Turbo-Pi"
 EVERY = 4  # of so many observations one is held out
 
 Batch = tuple[Observation, Tensor]
@@ -25,7 +25,7 @@ Batch = tuple[Observation, Tensor]
 def read_examples(policy: UnifiedPolicy, source: str | None, count: int) -> tuple[str, list[Example]]:
     """What the observations are, in words, and up to `count` of them, evenly spread over what there is.
 
-    source  a recording, a folder of observations, an .npz; None: LIBERO pictures, for that robot; "random-noise"
+    source  a recording, a folder of observations, an .npz; None: LIBERO images, for that robot; "random-noise"
 
     Raises ObservationError naming the one that can't be used, and where there are fewer than two.
     """

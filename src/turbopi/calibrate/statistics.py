@@ -105,7 +105,7 @@ def collect(
     for name, bins in counts.items():
         on_host = bins.cpu().double()
         if on_host[BINS:].any():
-            raise ObservationError(f"{name} sees values that aren't finite; are these weights or pictures damaged?")
+            raise ObservationError(f"{name} sees values that aren't finite; are these weights or images damaged?")
         found[name] = Histogram(on_host[:BINS], float(largest[name]), format)
     return found
 

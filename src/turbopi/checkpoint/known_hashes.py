@@ -22,18 +22,18 @@ def key_of(files: Sequence[Path], variant: str) -> str | None:
 
     `variant` is what else the values depend on, besides the files.
     """
-    told = []
+    reported = []
     try:
         for file in files:
             state = file.stat()
             if time.time() - state.st_mtime < _SETTLED_S:
                 return None
-            told.append([str(file.resolve()), state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns])
+            reported.append([str(file.resolve()), state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns])
     except OSError:
         return None
-    if not told:
+    if not reported:
         return None
-    return hashlib.sha256(json.dumps([_VERSION, variant, sorted(told)]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([_VERSION, variant, sorted(reported)]).encode()).hexdigest()
 
 
 def look_up(key: str) -> str | None:

@@ -245,7 +245,7 @@ class LeRobotFolder:
                 'processor; if that is right, correct config.json, or say {"normalization": ...} in turbopi.json'
             )
         if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
-            raise CheckpointError(f"{file} normalises pictures by {_bare(mapping['VISUAL'])}; expected IDENTITY")
+            raise CheckpointError(f"{file} normalises images by {_bare(mapping['VISUAL'])}; expected IDENTITY")
         if step is not None and step.config.number("eps", default=_EPS) != _EPS:
             raise CheckpointError(f"{file}: {name} has eps {step.config.values['eps']}; Turbo-Pi computes with {_EPS}")
         return _MODES[mode]

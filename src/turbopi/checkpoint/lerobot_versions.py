@@ -51,7 +51,7 @@ def sums_up_time(keys: Collection[str]) -> bool:
 
 def note(done: Semantics, written_by: Semantics | None, prompt_width: int) -> str:
     """What `inspect` should say where LeRobot's versions differ about a checkpoint, and nobody has chosen."""
-    computes = {"0.4": "pictures padded with -3", "0.6": "pictures padded with -1"}
+    computes = {"0.4": "images padded with -3", "0.6": "images padded with -1"}
     if prompt_width:
         computes["0.4"] = f"at least {prompt_width} numbers of state in the prompt, {computes['0.4']}"
         computes["0.6"] = f"the robot's own numbers of state in the prompt, {computes['0.6']}"

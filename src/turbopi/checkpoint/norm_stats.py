@@ -76,9 +76,9 @@ def _refuse(wrong: np.ndarray, where: object, expected: str, values: Mapping[str
     """CheckpointError about the first dimension that is wrong, if there is one."""
     if wrong.any():
         i = int(wrong.argmax())
-        told = ", ".join(f"{name}[{i}] is {array[i]:g}" for name, array in values.items())
+        named = ", ".join(f"{name}[{i}] is {array[i]:g}" for name, array in values.items())
         raise CheckpointError(
-            f"{where}: {told}; {expected} (in {int(wrong.sum())} of {len(wrong)} dimensions). The file is damaged, or "
+            f"{where}: {named}; {expected} (in {int(wrong.sum())} of {len(wrong)} dimensions). The file is damaged, or "
             "isn't one of statistics"
         )
 

@@ -184,8 +184,8 @@ class _Scales:
         if start not in _PLAIN_STARTS:
             odd["init_lora_weights"] = start
         if odd:
-            asked = ", ".join(f"{key} = {shown(value)}" for key, value in odd.items())
-            raise CheckpointError(f"{config.where} asks for {asked}, which Turbo-Pi doesn't merge. {_ADVICE}")
+            requested = ", ".join(f"{key} = {shown(value)}" for key, value in odd.items())
+            raise CheckpointError(f"{config.where} asks for {requested}, which Turbo-Pi doesn't merge. {_ADVICE}")
         self._rank, self._alpha = config.integer("r", 1, 2**20), config.number("lora_alpha", 0.0)
         self._stabilised = config.flag("use_rslora", False)
         self._ranks, self._alphas = self._pattern("rank_pattern"), self._pattern("alpha_pattern")

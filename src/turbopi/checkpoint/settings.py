@@ -15,7 +15,7 @@ itself.
     max_prompt_tokens     1 to 8192
     asset_id              folder of norm_stats.json below assets/; null for the only one there
     default_prompt        text or null
-    image_resize          "openpi", "lerobot", or "lerobot_0.4", which pads pictures with -3 instead of -1
+    image_resize          "openpi", "lerobot", or "lerobot_0.4", which pads images with -3 instead of -1
     prompt_state_dim      zeros fill the state up to so many numbers in the prompt (LeRobot 0.4: 32); null: nothing does
     prompt_as_is          true if Pi0's prompts keep their blanks, underscores and newlines, as in LeRobot
     prompt_labels         true if Pi0.5's prompts without a state keep "Task: " and "Action: ", as in LeRobot
@@ -217,8 +217,10 @@ def parse_values(values: Mapping[str, object], where: str) -> dict[str, Any]:
     """Check a settings object and bring it into PolicyConfig's types. ConfigError names the key and what it may be."""
     unknown = [key for key in values if key not in _SCHEMA]
     if unknown:
-        asked = [shown(key) + (f" ({meant})" if (meant := did_you_mean(key, _SCHEMA)) else "") for key in unknown[:5]]
-        raise ConfigError(f"{where}: unknown keys {', '.join(asked)}; known are {', '.join(_SCHEMA)}")
+        requested = [
+            shown(key) + (f" ({meant})" if (meant := did_you_mean(key, _SCHEMA)) else "") for key in unknown[:5]
+        ]
+        raise ConfigError(f"{where}: unknown keys {', '.join(requested)}; known are {', '.join(_SCHEMA)}")
     parsed = {}
     for key, value in values.items():
         expected, parse = _SCHEMA[key]

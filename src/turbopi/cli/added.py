@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from turbopi.cli.framework import Command, Described, app, describe, log_to_stderr, with_errors_told, without_types
+from turbopi.cli.framework import Command, Described, app, describe, log_to_stderr, with_errors_reported, without_types
 from turbopi.support import extensions
 from turbopi.support.errors import ConfigError
 
@@ -39,7 +39,7 @@ class Commands(TyperGroup):
             if (other := added().get(name)) is not None:
                 return name, loaded(other), args[1:]
             if name in ELSEWHERE:
-                with_errors_told(lambda: _refuse(ELSEWHERE[name]), debug=False)
+                with_errors_reported(lambda: _refuse(ELSEWHERE[name]), debug=False)
         return super().resolve_command(ctx, args)
 
 
@@ -61,7 +61,7 @@ def loaded(other: extensions.Extension) -> Any:
         except Exception as error:
             raise ConfigError(f"the {other} is no command: {extensions.reason(error)}") from error
 
-    with_errors_told(declare, debug=False)
+    with_errors_reported(declare, debug=False)
     return typer.main.get_command(alone)
 
 

@@ -83,7 +83,7 @@ def _axis(option: str, given: str | None, table: bool) -> list[int]:
 def _robots_own(
     axes: dict[str, str | None], table: bool, checkpoint: "Checkpoint", robot: "str | Robot", tokenizer: str | None
 ) -> dict[str, str | None]:
-    """The axes of a benchmark with a robot's own observations: these have its cameras, pictures and prompt."""
+    """The axes of a benchmark with a robot's own observations: these have its cameras, images and prompt."""
     from turbopi.bench.measure import robots_job
 
     clash = [option for option in ("--cameras", "--image-size", "--prompt-tokens") if axes[option] is not None]
@@ -178,7 +178,7 @@ def bench(
     ] = None,
     batch: Annotated[str | None, typer.Option(metavar="N,N,…", help="Observations of one call; else 1.")] = None,
     image_size: Annotated[
-        str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' pictures; else 224x224, the model's.")
+        str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' images; else 224x224, the model's.")
     ] = None,
     join: Annotated[
         str | None,
@@ -232,7 +232,7 @@ def bench(
 ) -> None:
     """Measure the policy's latency, each stage beside its floor: the least time that this machine needs for it.
 
-    Every call gets new pictures, another prompt and new noise, and is timed from host to host. With --robot the
+    Every call gets new images, another prompt and new noise, and is timed from host to host. With --robot the
     observations are random ones of that robot, with its cameras and its prompt, and the job has the checkpoint's own
     horizon and steps unless they are given.
     """
@@ -303,8 +303,8 @@ def bench(
             check_report(report / RESULTS, "floors", "a benchmark's results")
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
         document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
-    told = replace(document.provenance, command=["turbopi", *sys.argv[1:]])
-    document = replace(document, provenance=told, ready=starts if ready else None)
+    reported = replace(document.provenance, command=["turbopi", *sys.argv[1:]])
+    document = replace(document, provenance=reported, ready=starts if ready else None)
     _show(document, output)
     if report is not None:
         written = _write(document, report)
@@ -342,8 +342,8 @@ def _run_with_bar(
             if folder is not None:
                 _write_results(document, folder)
 
-        told = BenchProgress(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
-        return work(told)
+        reported = BenchProgress(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
+        return work(reported)
 
 
 def _write(document: "BenchDocument", folder: Path) -> list[Path]:

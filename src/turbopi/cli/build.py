@@ -169,11 +169,11 @@ def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tup
 
 
 def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, object]], str]:
-    """Observations under the robot's keys, and where they are from; None: the pictures that come with Turbo-Pi."""
+    """Observations under the robot's keys, and where they are from; None: the images that come with Turbo-Pi."""
     if path is None:
         from turbopi.policy.shipped import load_frames, observations
 
-        return observations(policy, load_frames()), "LIBERO pictures that come with Turbo-Pi"
+        return observations(policy, load_frames()), "LIBERO images that come with Turbo-Pi"
     from turbopi.cli.infer import _sources
     from turbopi.recordings import load_observation
 

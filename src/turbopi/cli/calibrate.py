@@ -44,7 +44,7 @@ def calibrate(
             "--observations",
             metavar="PATH",
             help="What `turbopi serve --record` wrote, a folder of observations, or an .npz. Unless given: LIBERO "
-            "pictures, for that robot. random-noise: noise alone, which every output of the policy will say.",
+            "images, for that robot. random-noise: noise alone, which every output of the policy will say.",
         ),
     ] = None,
     out: Annotated[

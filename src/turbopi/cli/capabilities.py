@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Offers:
+class Capabilities:
     """`UnifiedPolicy`'s attributes of these names, and its metadata's `real_time`."""
 
     real_time: Mapping[str, Any]
@@ -23,22 +23,22 @@ class Offers:
     batch_modes: "tuple[JoinMode, ...]"
 
 
-def offers_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Offers:
+def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capabilities:
     """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
     from turbopi import backends
     from turbopi.policy.call_options import Denoising
-    from turbopi.policy.chunk_conditioning import Joining
+    from turbopi.policy.chunk_conditioning import ChunkConditioning
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     name = backends.choose(device, precision)[0] if fitting.backend == "auto" else fitting.backend  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
     cls = backends.class_of(name)
-    asked = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
+    requested = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
     no_pipeline: Any = None  # no observation is read
-    modes = Joining(checkpoint.config, no_pipeline, cls, asked.integration).modes
-    batches = cls.runs_batches and (asked.integration is None or asked.integration.is_euler)
-    return Offers(
+    modes = ChunkConditioning(checkpoint.config, no_pipeline, cls, requested.integration).modes
+    batches = cls.runs_batches and (requested.integration is None or requested.integration.is_euler)
+    return Capabilities(
         real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},
         pipelined=cls.submits,
         batch_modes=modes if batches else (),
@@ -52,9 +52,9 @@ def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "C
     from turbopi.serve.calls import largest_batch
     from turbopi.serve.real_time import check_execution
 
-    offers = offers_of(options, checkpoint)
-    check_execution(server, offers.real_time, checkpoint.config.model.action_horizon)
-    largest_batch(server, pipelined=offers.pipelined, batch_modes=offers.batch_modes)
+    offered = capabilities_of(options, checkpoint)
+    check_execution(server, offered.real_time, checkpoint.config.model.action_horizon)
+    largest_batch(server, pipelined=offered.pipelined, batch_modes=offered.batch_modes)
 
 
 def check_warmup(warmup: bool, strict: bool, max_batch: int | None) -> None:

@@ -39,7 +39,7 @@ def demo(
     options: PolicyOptions,
     checkpoint: CheckpointArgument = None,
     report: Annotated[
-        Path, typer.Option("--report", metavar="DIR", help="Where pictures, actions and numbers are written.")
+        Path, typer.Option("--report", metavar="DIR", help="Where images, actions and numbers are written.")
     ] = Path("turbopi-report"),
     frames: Annotated[
         int | None,
@@ -66,7 +66,7 @@ def demo(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a policy on real LIBERO pictures, check it against the float32 reference, and let it act in the simulator.
+    """Run a policy on real LIBERO images, check it against the float32 reference, and let it act in the simulator.
 
     Without a checkpoint it is the small policy that comes with Turbo-Pi, trained on these tasks; its chunks are set
     against what the expert did that it learned from. Where the simulator is installed (in a clone: scripts/setup
@@ -80,7 +80,7 @@ def demo(
         if episodes == 0:
             raise ConfigError("--real-time plays episodes, and --episodes is 0: give 1 or more, or leave it out")
         if frames is not None:
-            raise ConfigError("--frames is for pictures of LIBERO, which --real-time doesn't show: leave it out")
+            raise ConfigError("--frames is for images of LIBERO, which --real-time doesn't show: leave it out")
         from turbopi.cli.demo_real_time import show_real_time
 
         show_real_time(options, checkpoint, episodes, seed, report, Output(as_json))
@@ -275,7 +275,7 @@ class _Run:
             Row(
                 heading=f"“{frame.prompt}”    {result['policy_timing']['total_ms']:.0f} ms, "
                 f"rms error {significant(difference.rms)}",
-                pictures={"base camera": frame.base, "wrist camera": frame.wrist},
+                camera_images={"base camera": frame.base, "wrist camera": frame.wrist},
                 actions=result["actions"],
                 oracle=truth,
                 expert=frame.expert if self.robot == "libero" and not self.metadata["random_weights"] else None,

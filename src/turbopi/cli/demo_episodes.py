@@ -51,11 +51,11 @@ def play_episodes(
     results = prepare(folder, protocol, source, simulator, jobs, restart=True)
     output.line(f"{len(jobs)} episodes of {SUITE}, from initial states that the small policy never saw:")
 
-    def told(episode: "Episode", results: "Results") -> None:
+    def reported(episode: "Episode", results: "Results") -> None:
         task = results.tasks[episode.task].instruction
         output.line(f"  {task}: {episode.status} after {episode.steps} steps ({episode.seconds:.0f} s)")
 
-    evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=plan, on_episode=told)
+    evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=plan, on_episode=reported)
     summary = results.summary()
     success, call = summary.success, summary.call_ms
     took = f"; a chunk took {call.p50:.0f} ms (95 %: {call.p95:.0f} ms)" if call else ""

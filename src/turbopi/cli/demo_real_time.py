@@ -69,7 +69,7 @@ def show_real_time(
     )
     report.mkdir(parents=True, exist_ok=True)
     plots = [plot_successes(report / "real_time.png", played), plot_commands(report / "commands.png", played)]
-    told = {
+    reported = {
         "episodes": count,
         "execution_horizon": HORIZON,
         "ways": [
@@ -86,9 +86,9 @@ def show_real_time(
         "joining_gains": plain_document(gain.document),
         "policy": plain(policy.metadata),
     }
-    write_whole(report / "real_time.json", json.dumps(told, indent=1) + "\n")
+    write_whole(report / "real_time.json", json.dumps(reported, indent=1) + "\n")
     output.line(f"plots: {', '.join(map(str, plots))}")
-    output.document({name: value for name, value in told.items() if name != "policy"} | {"report": str(report)})
+    output.document({name: value for name, value in reported.items() if name != "policy"} | {"report": str(report)})
 
 
 def _points(paired: "Paired") -> str:

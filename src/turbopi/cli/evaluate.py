@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
-from turbopi.cli.capabilities import offers_of
+from turbopi.cli.capabilities import capabilities_of
 from turbopi.cli.evaluate_options import EvalOptions
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
@@ -67,8 +67,8 @@ def evaluate_command(
         str | None,
         typer.Option(
             "--control",
-            metavar="prompt|pictures",
-            help="Give the policy another task's prompt, or pictures: it should fail.",
+            metavar="prompt|images",
+            help="Give the policy another task's prompt, or images: it should fail.",
         ),
     ] = None,
     as_json: JsonFlag = False,
@@ -139,7 +139,7 @@ def _check_cells(
     """Raise ConfigError for what the policy won't be able to do, before its weights are loaded."""
     from turbopi.evaluate.checks import check_delay, check_offered
 
-    offered, horizon = offers_of(options, opened).real_time, opened.config.model.action_horizon
+    offered, horizon = capabilities_of(options, opened).real_time, opened.config.model.action_horizon
     for cell in cells:
         own = cell.protocol(protocol)
         check_offered(offered, None, own)
@@ -172,18 +172,18 @@ def _run_cells(
             done.append((cell, run_with_progress(options, own, source, simulator, jobs, folder / cell.folder, output)))
     finally:
         page = write_delays(folder, done) if done else None
-    told = document(done)
+    reported = document(done)
     table = Table(title=escape(f"{protocol.suite} under delay: {source.label}"), title_justify="left")
-    for head in heads(told.cells):
+    for head in heads(reported.cells):
         table.add_column(escape(head), justify="left" if head == "execution" else "right")
-    for summary in told.cells:
+    for summary in reported.cells:
         table.add_row(*row(summary))
     output.table(table)
-    for note in notes(told.cells, protocol.control_hz):
+    for note in notes(reported.cells, protocol.control_hz):
         output.line(note, "yellow")
     output.line(f"report: {page}")
-    cells_told = plain_document(told)["cells"]
-    output.document({"folder": folder, "file": FILE, "first": told.first, "cells": cells_told})
+    cells_reported = plain_document(reported)["cells"]
+    output.document({"folder": folder, "file": FILE, "first": reported.first, "cells": cells_reported})
     return all(results.complete for _, results in done)
 
 
@@ -215,7 +215,7 @@ def run_with_progress(
     max_batch   requests that are computed together, unless the options say; None: as many as workers
     """
     from turbopi.evaluate.checks import check_delay, check_fit
-    from turbopi.evaluate.pacing import rate_told
+    from turbopi.evaluate.pacing import rate_given
     from turbopi.evaluate.run import default_workers, evaluate, most_at_once, pending, prepare
     from turbopi.evaluate.visited import Recording
     from turbopi.realtime import way_named
@@ -229,7 +229,7 @@ def run_with_progress(
     workers = 1 if options.real_time else min(options.workers or default_workers(), most_at_once(protocol, to_run))
     max_batch = options.max_batch or max_batch or workers
     hz = protocol.control_hz
-    paced = "" if hz is None else f" in real time ({rate_told(hz, simulator.control_hz)})"
+    paced = "" if hz is None else f" in real time ({rate_given(hz, simulator.control_hz)})"
     output.line(f"{protocol.suite}: {len(jobs)} episodes{paced} with {source.label} into {folder}")
     if left < len(jobs):
         output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
@@ -243,7 +243,7 @@ def run_with_progress(
             hook(*request)
 
     try:
-        with _told(output, len(jobs), len(jobs) - left) as on_episode:
+        with _reported(output, len(jobs), len(jobs) - left) as on_episode:
             return evaluate(
                 results,
                 protocol,
@@ -262,7 +262,7 @@ def run_with_progress(
 
 
 @contextmanager
-def _told(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
+def _reported(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
     """Progress: a bar with the running success on a terminal, else a line an episode."""
     if not output.shows_progress:
         yield lambda episode, results: output.line(f"{_line(episode)}; {_running(results)}")
@@ -322,10 +322,10 @@ def _show(results: "Results", output: Output) -> None:
         if ms is not None:
             output.line(f"{what}: p50 {ms.p50:.1f}, p95 {ms.p95:.1f}, p99 {ms.p99:.1f} ms")
     if summary.real_time is not None and results.control_hz is not None:
-        from turbopi.evaluate.pacing import told_of_lateness, told_of_pace
+        from turbopi.evaluate.pacing import allows_for_lateness, knows_pace
 
-        output.line(told_of_pace(summary.real_time, results.control_hz))
-        if (late := told_of_lateness(summary.real_time, results.control_hz)) is not None:
+        output.line(knows_pace(summary.real_time, results.control_hz))
+        if (late := allows_for_lateness(summary.real_time, results.control_hz)) is not None:
             output.line(late, "yellow" if summary.real_time.is_real_time else "red")
     if summary.aborted:
         output.line(

@@ -31,7 +31,7 @@ OF_CHECKPOINT = {  # what may come from a checkpoint, too: an option's name, and
 
 
 @dataclass(frozen=True)
-class Asked:
+class Requested:
     """The options that decide what a replica runs."""
 
     policy: PolicyOptions
@@ -45,7 +45,7 @@ class Asked:
         values = {**asdict(self.policy), **line, "warmup": self.warmup, "strict": self.strict}
         return {name: value for name, value in values.items() if name not in ("random_weights", "weights_seed")}
 
-    def kept(self, running: Mapping[str, Any], given: Collection[str]) -> "Asked":
+    def kept(self, running: Mapping[str, Any], given: Collection[str]) -> "Requested":
         """The same, with the options of the running fleet for those that weren't given.
 
         Raises ConfigError if that isn't known, or contradicts itself.
@@ -64,7 +64,7 @@ class Asked:
         if "quantization" in given and "fp8_parts" not in given:
             stays["fp8_parts"] = running["fp8_parts"]
         of_policy = {field.name for field in fields(self.policy)}
-        kept = Asked(
+        kept = Requested(
             policy=replace(self.policy, **{name: value for name, value in stays.items() if name in of_policy}),
             server=replace(self.server, **{name: value for name, value in stays.items() if name in OF_LINE}),
             warmup=stays.get("warmup", self.warmup),
@@ -95,11 +95,11 @@ def runs(policy: PolicyOptions, opened: "Checkpoint") -> dict[str, Any]:
     from turbopi.policy.call_options import Denoising
 
     fitting = policy.for_checkpoint(opened)
-    asked: Any = (fitting.steps, fitting.solver, typed_grid(fitting.time_grid))
+    requested: Any = (fitting.steps, fitting.solver, typed_grid(fitting.time_grid))
     return {
         "config": opened.config.name,
         "precision": fitting.precision_of(fitting.backend),
-        **Denoising.of(opened.config, *asked).metadata,
+        **Denoising.of(opened.config, *requested).metadata,
     }
 
 

@@ -195,7 +195,7 @@ def describe(
             _refuse_nan(given)
             function(**values)
 
-        with_errors_told(work, debug=debug, owner=owner)
+        with_errors_reported(work, debug=debug, owner=owner)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     own = inspect.signature(function, eval_str=True).parameters.values()
@@ -231,7 +231,7 @@ def _epilog(examples: Sequence[str]) -> str:
     return "\n\n".join(["[bold]Examples[/]", *lines])
 
 
-def with_errors_told(work: Callable[[], None], *, debug: bool, owner: str = "Turbo-Pi's own") -> None:
+def with_errors_reported(work: Callable[[], None], *, debug: bool, owner: str = "Turbo-Pi's own") -> None:
     """Run a command; an error becomes one red line on stderr and an exit code, and a fault of `owner` a traceback."""
     rich.reconfigure(stderr=True)  # progress bars of the library use rich's own console
     log_to_stderr()

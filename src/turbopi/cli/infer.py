@@ -50,7 +50,7 @@ def infer(
         typer.Argument(
             metavar="[CHECKPOINT] OBSERVATION",
             help="The checkpoint's folder (none with --random-weights), then the observation: an .npz with the robot's "
-            "keys; a folder with observation.json and the pictures that it names; or what `turbopi serve --record` "
+            "keys; a folder with observation.json and the images that it names; or what `turbopi serve --record` "
             "wrote, a call or a folder of them.",
             show_default=False,
         ),
@@ -162,7 +162,7 @@ def _is_of(file: Path, source: Path) -> bool:
     if not source.is_dir():
         return file.samefile(source)
     place, folder = file.resolve(), source.resolve()
-    if place.parent != folder:  # of a recording's run, or a picture in a folder of its own
+    if place.parent != folder:  # of a recording's run, or an image in a folder of its own
         return place.is_relative_to(folder)
     described = source / "observation.json"
     if described.is_file():
@@ -262,11 +262,11 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
 
 
 def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:
-    from turbopi.support.action_groups import pictures_of
+    from turbopi.support.action_groups import images_of
     from turbopi.support.plots import Row, plot_chunks
 
     rows = [
-        Row(_prompt(answer.observation, about), pictures_of(answer.observation), answer.actions)
+        Row(_prompt(answer.observation, about), images_of(answer.observation), answer.actions)
         for answer in answers
         if answer.observation is not None
     ]

@@ -35,7 +35,7 @@ EngineCalibration = Annotated[
     typer.Option(
         metavar="PATH",
         help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
-        "Unless given, the LIBERO pictures that come with Turbo-Pi.",
+        "Unless given, the LIBERO images that come with Turbo-Pi.",
     ),
 ]
 ScaleMethod = Annotated[

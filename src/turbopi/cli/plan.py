@@ -114,7 +114,7 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         serve += f" --max-clients {fleet.robots}"
     a_second = fleet.robots * fleet.hz / fleet.steps
     each_has = f"{planned.robots_per_gpu} robot{'s' * (planned.robots_per_gpu > 1)}"
-    told = [
+    reported = [
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
         f"  {a_second:.1f} observations a second",
         f"{table.gpu}, {table.backend} {table.precision}, {kind} ({table.job}):",
@@ -128,14 +128,14 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         f"run          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else ""),
     ]
     if fleet.steps == fleet.horizon:
-        told.append("Robots carry out whole chunks, and stand still for the delay")
+        reported.append("Robots carry out whole chunks, and stand still for the delay")
     if (alone := fleet.delay(planned.worst_seconds, 1)) < planned.delay_steps:
-        told.append(f"Without Ray, a server on each GPU: {alone} control steps at most")
+        reported.append(f"Without Ray, a server on each GPU: {alone} control steps at most")
     if planned.robots_per_gpu > MOST_AT_ONCE and planned.gpus > 1:
-        told.append(f"A replica takes {MOST_AT_ONCE} requests at once, so the delay may be longer: take more GPUs")
+        reported.append(f"A replica takes {MOST_AT_ONCE} requests at once, so the delay may be longer: take more GPUs")
     if (servers := math.ceil(a_second / DECODED)) > 1:
-        told.append(f"One server decodes some {DECODED} observations a second: take {servers} servers")
+        reported.append(f"One server decodes some {DECODED} observations a second: take {servers} servers")
     if fleet.robots > 1 and len(table.seconds) == 1:
         options = f"--horizons {table.job.horizon} --batch 1,2,4,8"
-        told.append(f"Batches of such chunks weren't measured there: `turbopi bench {options}`, then --times")
-    return told
+        reported.append(f"Batches of such chunks weren't measured there: `turbopi bench {options}`, then --times")
+    return reported

@@ -61,8 +61,8 @@ def _table(job: "Job", predictions: "Sequence[Prediction]") -> Table:
         floors = [f"{one.floor_ms[name]:.2f}" for name in (*STAGES, "total")]
         name = f"{one.gpu.key} {one.precision}"
         for call in one.calls:
-            told = call_text(call) + (MEASURED if one.was_measured(call) else "")
-            table.add_row(name, *floors, told, "portable" if _not_its_own(one.gpu, call) else call.backend)
+            reported = call_text(call) + (MEASURED if one.was_measured(call) else "")
+            table.add_row(name, *floors, reported, "portable" if _not_its_own(one.gpu, call) else call.backend)
         if not one.calls:
             table.add_row(name, *floors, "-", "")
     return table

@@ -7,13 +7,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from turbopi.cli.framework import Output, new_console
 
-Told = TypeVar("Told")
+Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
 def with_stages(
-    work: Callable[[Told], Result],
-    told: Callable[[Callable[[str, int], None], Callable[[], None]], Told],
+    work: Callable[[Given], Result],
+    reported: Callable[[Callable[[str, int], None], Callable[[], None]], Given],
     output: Output,
 ) -> Result:
     """work(told(begin, advance)): `begin(text, total)` opens a stage, `advance()` is one step of it."""
@@ -25,4 +25,4 @@ def with_stages(
         def begin(text: str, total: int) -> None:
             bar.reset(task, description=text, total=total, visible=True)
 
-        return work(told(begin, lambda: bar.advance(task)))
+        return work(reported(begin, lambda: bar.advance(task)))

@@ -10,7 +10,7 @@ import typer
 from turbopi.cli.api_key import ApiKey, chosen_key
 from turbopi.cli.capabilities import check_server, check_warmup
 from turbopi.cli.files import check_folder
-from turbopi.cli.fleet_update import Asked
+from turbopi.cli.fleet_update import Requested
 from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
@@ -102,7 +102,7 @@ def serve(
         bool | None,
         typer.Option(
             "--page/--no-page",
-            help="A page for your browser on the same port: robots, pictures, action chunks, latency.",
+            help="A page for your browser on the same port: robots, images, action chunks, latency.",
             show_default="on, unless others could see it without an API key",
         ),
     ] = None,
@@ -195,8 +195,8 @@ def serve(
         )
     if ray:
         given = [name for name in context.params if _was_given(context, name)]
-        asked = Asked(options, wanted, warmup, strict)
-        serve_fleet(wishes, asked, checkpoint, output, given=given, before_serving=_log_all)
+        requested = Requested(options, wanted, warmup, strict)
+        serve_fleet(wishes, requested, checkpoint, output, given=given, before_serving=_log_all)
         return
     opened = options.open(checkpoint)
     check_server(wanted, options, opened)

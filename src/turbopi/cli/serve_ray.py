@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from turbopi.cli.capabilities import check_server
-from turbopi.cli.fleet_update import Asked, as_before, changes, of_the_front, runs, scale_of, scaled_as
+from turbopi.cli.fleet_update import Requested, as_before, changes, of_the_front, runs, scale_of, scaled_as
 from turbopi.cli.framework import Output
 from turbopi.cli.options import PolicyOptions
 from turbopi.support.errors import BackendError, ConfigError
@@ -102,17 +102,17 @@ class FleetWishes:
         if self.update and self.name is None:
             raise ConfigError("--update needs the running fleet's name: --fleet NAME")
 
-    def options(self, asked: Asked, checkpoint: str | None) -> "FleetOptions":
+    def options(self, requested: Requested, checkpoint: str | None) -> "FleetOptions":
         """The fleet's options. Raises ConfigError."""
         from turbopi.serve.fleet.fleet import FleetOptions, line_of
         from turbopi.serve.fleet.ray_app import gpus_for, name_of, read_autoscaling
 
-        name = name_of(checkpoint, asked.policy.random_weights)
-        use_gpus = gpus_for(asked.policy.device)
+        name = name_of(checkpoint, requested.policy.random_weights)
+        use_gpus = gpus_for(requested.policy.device)
         if self.gpus == "all" and use_gpus is False:
             raise ConfigError(
-                f"--gpus all gives each replica a GPU, but --device {asked.policy.device} was asked for: leave out one "
-                "of them; --replicas says how many run on CPUs"
+                f"--gpus all gives each replica a GPU, but --device {requested.policy.device} was asked for: leave "
+                "out one of them; --replicas says how many run on CPUs"
             )
         return FleetOptions(
             name=self.name or name,
@@ -120,13 +120,13 @@ class FleetWishes:
             replicas=self.replicas,
             use_gpus=True if self.gpus == "all" else use_gpus,
             autoscaling=read_autoscaling(self.autoscaling),
-            line=line_of(asked.server),
+            line=line_of(requested.server),
         )
 
 
 def serve_fleet(
     wishes: FleetWishes,
-    asked: Asked,
+    requested: Requested,
     checkpoint: str | None,
     output: Output,
     *,
@@ -144,21 +144,21 @@ def serve_fleet(
 
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks Ray after its end mustn't start another one
     fleet.import_ray()
-    asked = replace(asked, policy=_for_workers(asked.policy))
-    options = wishes.options(asked, checkpoint)
+    requested = replace(requested, policy=_for_workers(requested.policy))
+    options = wishes.options(requested, checkpoint)
     if wishes.update:
         with _cluster(output.console) as ours:
             check_runs(options.name, [] if ours else fleet.names())
-            _update(wishes, asked, checkpoint, output, given)
+            _update(wishes, requested, checkpoint, output, given)
     else:
-        opened = _open(asked, checkpoint, output)  # what is wrong with it shows here, not in a replica's log
+        opened = _open(requested, checkpoint, output)  # what is wrong with it shows here, not in a replica's log
         with _cluster(output.console):
-            _serve(options, asked, checkpoint, opened, output, before_serving)
+            _serve(options, requested, checkpoint, opened, output, before_serving)
 
 
 def _serve(
     options: "FleetOptions",
-    asked: Asked,
+    requested: Requested,
     checkpoint: str | None,
     opened: "Checkpoint",
     output: Output,
@@ -171,13 +171,13 @@ def _serve(
     with claimed(options.name):
         fleet.check_is_fleet(options.name)
         if options.name in fleet.names():
-            _check_orphan(options.name, asked.policy, opened, output)
+            _check_orphan(options.name, requested.policy, opened, output)
         fleet.check_capacity(options)
         try:
-            _deploy(options, asked, checkpoint, output)
+            _deploy(options, requested, checkpoint, output)
             policies = fleet.Fleet.attach(options.name)
             before_serving()
-            serving.run(policies, asked.server, console=output.console, calls=policies.calls)
+            serving.run(policies, requested.server, console=output.console, calls=policies.calls)
         finally:
             fleet.delete(options.name)
 
@@ -195,50 +195,52 @@ def _check_orphan(name: str, policy: PolicyOptions, opened: "Checkpoint", output
     output.line(f"The fleet {name} is there without a server, which must have crashed: its replicas are replaced.")
 
 
-def _update(wishes: FleetWishes, asked: Asked, checkpoint: str | None, output: Output, given: Collection[str]) -> None:
+def _update(
+    wishes: FleetWishes, requested: Requested, checkpoint: str | None, output: Output, given: Collection[str]
+) -> None:
     from turbopi.serve.fleet import fleet
 
-    typed = asked.plain()
+    typed = requested.plain()
     name = wishes.name
     assert name is not None
     fleet.check_is_fleet(name)
     running = fleet.Fleet.attach(name)
     before = running.started_with()
-    asked = asked.kept(before, given)
-    opened = _open(asked, checkpoint, output)
-    check_fits(running.metadata, opened.config.model.action_horizon, robot_of(asked.policy, opened))
-    options = scaled_as(wishes.options(asked, checkpoint), before, given)
+    requested = requested.kept(before, given)
+    opened = _open(requested, checkpoint, output)
+    check_fits(running.metadata, opened.config.model.action_horizon, robot_of(requested.policy, opened))
+    options = scaled_as(wishes.options(requested, checkpoint), before, given)
     fleet.check_capacity(options)
-    after = asked.plain() | scale_of(options, *fleet.planned(options))
+    after = requested.plain() | scale_of(options, *fleet.planned(options))
     if ignored := of_the_front(given, after):
         output.line(f"note: {', '.join(ignored)}: of the server in front, which an update leaves as it is", "yellow")
     if kept := as_before(typed, after):
         output.line(f"As in the running fleet: {', '.join(kept)}.")
-    for line in changes(before, after, running.metadata, runs(asked.policy, opened)):
+    for line in changes(before, after, running.metadata, runs(requested.policy, opened)):
         output.line(line)
-    count = _deploy(options, asked, checkpoint, output)
+    count = _deploy(options, requested, checkpoint, output)
     output.line(f"Updated: {count} of {count} replicas run {options.checkpoint}.")
 
 
-def _open(asked: Asked, checkpoint: str | None, output: Output) -> "Checkpoint":
+def _open(requested: Requested, checkpoint: str | None, output: Output) -> "Checkpoint":
     """The checkpoint, with what can be said of it before a replica loads it. Raises ConfigError and CheckpointError."""
-    opened = asked.policy.open(checkpoint)
-    anywhere = replace(asked.policy, backend="pytorch", precision=None, device="cpu")  # replicas may run elsewhere
-    check_server(replace(asked.server, max_batch=None), anywhere, opened)
-    asked.policy.tell_if_random(opened, output)
+    opened = requested.policy.open(checkpoint)
+    anywhere = replace(requested.policy, backend="pytorch", precision=None, device="cpu")  # replicas may run elsewhere
+    check_server(replace(requested.server, max_batch=None), anywhere, opened)
+    requested.policy.tell_if_random(opened, output)
     return opened
 
 
-def _deploy(options: "FleetOptions", asked: Asked, checkpoint: str | None, output: Output) -> int:
+def _deploy(options: "FleetOptions", requested: Requested, checkpoint: str | None, output: Output) -> int:
     """Start or replace the replicas; returns their number."""
     from turbopi.serve.fleet import fleet
     from turbopi.serve.fleet.ray_app import warm_up_of
 
     count, use_gpus = fleet.planned(options)
-    make = partial(make_policy, asked.policy, _absolute(checkpoint), asked.strict)
-    warm = warm_up_of(asked.warmup, asked.server.execution)
+    make = partial(make_policy, requested.policy, _absolute(checkpoint), requested.strict)
+    warm = warm_up_of(requested.warmup, requested.server.execution)
     application = fleet.replicas(
-        make, options, warm=warm, started_with=asked.plain() | scale_of(options, count, use_gpus)
+        make, options, warm=warm, started_with=requested.plain() | scale_of(options, count, use_gpus)
     )
     output.line(
         f"Fleet {options.name}: {count} replica{'s' * (count > 1)} of {options.checkpoint}, "
@@ -252,10 +254,10 @@ def robot_of(policy: PolicyOptions, opened: "Checkpoint") -> str | None:
     """The robot's name as the policy's metadata will have it; None for a class of the user's, which isn't run here."""
     from turbopi.robots import robot_for
 
-    config, asked = opened.config, policy.robot
-    if ":" in (asked or config.robot):
+    config, requested = opened.config, policy.robot
+    if ":" in (requested or config.robot):
         return None
-    return robot_for(config.robot if asked is None else asked, config.robot, config.robot_options).name
+    return robot_for(config.robot if requested is None else requested, config.robot, config.robot_options).name
 
 
 def check_runs(name: str, running: list[str]) -> None:

@@ -15,7 +15,7 @@ _COLUMNS = {
 }
 
 STAGES = (
-    "vision, prefix (the tokens of pictures and prompt) and denoise (the actions) are the model's stages; queue is "
+    "vision, prefix (the tokens of images and prompt) and denoise (the actions) are the model's stages; queue is "
     "waiting for other calls"
 )
 

@@ -42,7 +42,7 @@ def verify(
             "--observations",
             metavar="PATH",
             help="What `turbopi serve --record` wrote, an .npz, or a folder with observation.json. Unless given: "
-            "LIBERO pictures for that robot, then random examples.",
+            "LIBERO images for that robot, then random examples.",
         ),
     ] = None,
     count: Annotated[
@@ -127,8 +127,8 @@ def _show(document: "Certificate", output: Output) -> None:
     output.line(f"weights {document.weights.fingerprint or 'not hashed'}")
     output.line(f"observations {observed.sha256}")
     if document.calibrated is not None:
-        told = as_document(document.calibrated, CalibrationDetails, "the policy's calibration")
-        output.line(_calibration(told, document.precision))
+        reported = as_document(document.calibrated, CalibrationDetails, "the policy's calibration")
+        output.line(_calibration(reported, document.precision))
         seen = observed.calibrated_on
         output.line(f"{seen} of {observed.count} observations were calibrated on", "yellow" if seen else None)
     output.table(_intermediates(document))
@@ -164,15 +164,14 @@ def _show(document: "Certificate", output: Output) -> None:
         output.line(f"{'ok  ' if check.ok else 'FAIL'} {check.text}", None if check.ok else "red")
 
 
-def _calibration(told: "CalibrationDetails", precision: str) -> str:
+def _calibration(reported: "CalibrationDetails", precision: str) -> str:
     """Which products run in eight bits, by what."""
     numbers = precision.split("-")[0]
-    groups = {name: state if isinstance(state, str) else "in part" for name, state in told.plan.items()}
+    groups = {name: state if isinstance(state, str) else "in part" for name, state in reported.plan.items()}
     others = sorted(name for name, state in groups.items() if not state.startswith(numbers))
     kept = f"all but {', '.join(others)}" if others else "every site"
-    return (
-        f"{numbers.upper()} in {kept}; calibration {told.calibration} ({told.identity[:16]}…), on {told.observations}"
-    )
+    of_file = f"calibration {reported.calibration} ({reported.identity[:16]}…), on {reported.observations}"
+    return f"{numbers.upper()} in {kept}; {of_file}"
 
 
 def _intermediates(document: "Certificate") -> Table:

@@ -59,10 +59,10 @@ def view(
     api_key_file: ApiKeyFile = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Look at a recording, or at a live server, in the rerun viewer: pictures, state, chunks, latency, errors.
+    """Look at a recording, or at a live server, in the rerun viewer: images, state, chunks, latency, errors.
 
     Needs rerun, the extra `view`. A recording is shown call for call. Of a live server, whose page must be on, the
-    viewer gets what the page does: small pictures, and some calls a second of each robot.
+    viewer gets what the page does: small images, and some calls a second of each robot.
     """
     output = Output(as_json)
     from turbopi.view import unavailable

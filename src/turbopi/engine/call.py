@@ -139,8 +139,8 @@ class Part:
 
     def resized(self, ops: Ops) -> Tensor:
         """`images`, by a kernel, from what `send` has sent."""
-        assert ops.resize_pictures is not None, "else the host has resized them: `transferred`"
-        ops.resize_pictures(self.resizer.table, self.images)
+        assert ops.resize_images is not None, "else the host has resized them: `transferred`"
+        ops.resize_images(self.resizer.table, self.images)
         return self.images
 
 
@@ -181,7 +181,7 @@ class Images:
         """Whether `run_resized` is needed: some image hasn't the size and dtype of `images`, and the device may
         resize it.
         """
-        if resize is None or self.ops.resize_pictures is None:
+        if resize is None or self.ops.resize_images is None:
             return False
         return not all(self._parts[0].fits(one) for one in images)
 

@@ -46,10 +46,10 @@ _DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
 _RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional arguments; PyTorch's default is 8
 
 
-def _resize_pictures(table: Tensor, images: Tensor) -> None:
-    from turbopi.kernels.portable.resize import resize_pictures  # Triton is there where Inductor is
+def _resize_images(table: Tensor, images: Tensor) -> None:
+    from turbopi.kernels.portable.resize import resize_images  # Triton is there where Inductor is
 
-    resize_pictures(table, images)
+    resize_images(table, images)
 
 
 def _batch() -> BatchOps:
@@ -84,7 +84,7 @@ def compiled() -> Ops:
 
     return Ops(
         transfer=transfer,
-        resize_pictures=_resize_pictures if torch.cuda.is_available() else None,
+        resize_images=_resize_images if torch.cuda.is_available() else None,
         embed_patches=embed_patches,
         embed_prompt=embed_prompt,
         residual_rms_norm=_compiled(residual_rms_norm),

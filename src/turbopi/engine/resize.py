@@ -12,7 +12,7 @@ from torch import Tensor
 
 from turbopi.config import ImageResize
 from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
-from turbopi.preprocess.images import RESIZES, copy_picture, placement
+from turbopi.preprocess.images import RESIZES, copy_image, placement
 
 MOST_SIZES = 16  # of images whose weights are cached
 
@@ -46,7 +46,7 @@ class Resizer:
         """A row of the table."""
         rows, columns, top, left = self._place(image.shape[0], image.shape[1])
         host, device = self._stage(camera, image.size)
-        copy_picture(image, host.numpy().reshape(image.shape))
+        copy_image(image, host.numpy().reshape(image.shape))
         device.copy_(host, non_blocking=True)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
         sizes = (image.shape[1], image.shape[0], columns.weights.shape[1], rows.weights.shape[1])

@@ -119,7 +119,7 @@ class GraphRunner:
         self._warm(1, cameras, float_images, self._loop(conditioning, num_steps, actions))
 
     def _warm(self, batch: int, images: int, float_images: bool, loop: Loop) -> None:
-        resizes, most = self._ops.resize_pictures is not None, self.config.max_prompt_tokens
+        resizes, most = self._ops.resize_images is not None, self.config.max_prompt_tokens
         self._warming = True
         try:
             for key in plan.warm_graphs(batch, images, float_images, loop, most, resizes=resizes):

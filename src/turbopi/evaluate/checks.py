@@ -87,7 +87,7 @@ def check_way(source: PolicySource, protocol: Protocol) -> None:
     check_offered(source.real_time, source.about.get("server"), protocol)
 
 
-def check_offered(told: Mapping[str, Any], where: object, protocol: Protocol) -> None:
+def check_offered(reported: Mapping[str, Any], where: object, protocol: Protocol) -> None:
     """`check_way` of a policy that isn't there yet.
 
     told   what its metadata says under "real_time"
@@ -96,14 +96,15 @@ def check_offered(told: Mapping[str, Any], where: object, protocol: Protocol) ->
     way = way_named(protocol.execution)
     who = "this policy" if where is None else f"the policy server at {where}"
     if way.mode is None:
-        if told.get("execution") is not None and protocol.control_hz is None:  # the executor tells it what it must know
+        # with a control rate the executor says what it must know
+        if reported.get("execution") is not None and protocol.control_hz is None:
             raise ConfigError(
-                f"{who} joins chunks itself (it was started with --execution {shown(told['execution'])}) and counts "
-                f"actions by its own clock, which a simulated delay doesn't follow: start it without --execution, and "
-                "give that to turbopi eval, or take --real-time"
+                f"{who} joins chunks itself (it was started with --execution {shown(reported['execution'])}) "
+                f"and counts actions by its own clock, which a simulated delay doesn't follow: start it without "
+                "--execution, and give that to turbopi eval, or take --real-time"
             )
         return
-    modes = told.get("modes")
+    modes = reported.get("modes")
     if not isinstance(modes, list | tuple) or not modes:
         instead = "take a backend that joins chunks" if where is None else "serve the checkpoint with `turbopi serve`"
         raise ConfigError(
@@ -112,7 +113,7 @@ def check_offered(told: Mapping[str, Any], where: object, protocol: Protocol) ->
         )
     if way.mode not in modes:
         raise ConfigError(f"--execution {way.name} isn't offered by {who}, which offers {shown(modes)}; {_FREE}")
-    longest = told.get("trained_max_delay")
+    longest = reported.get("trained_max_delay")
     if way.holds and isinstance(longest, int) and protocol.delay > longest:
         raise ConfigError(
             f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name}: {who} was trained with "

@@ -13,7 +13,7 @@ from turbopi.evaluate.results import Plain, Results
 from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
 from turbopi.evaluate.visited import ActionDifference
 from turbopi.quantization.calibration_file import RANDOM_NOISE
-from turbopi.quantization.formats import told_by
+from turbopi.quantization.formats import named_by
 from turbopi.quantization.plan import format_of
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
@@ -84,10 +84,14 @@ class Compared:
         """What the policy ran in, where it told; a calibration on noise says so."""
         policy = self.results.policy
         precision = str(policy.identity.get("precision") or "-")
-        noisy = (told_by(policy.about.get("backend_details")) or {}).get("observations") == RANDOM_NOISE
+        noisy = (named_by(policy.about.get("backend_details")) or {}).get("observations") == RANDOM_NOISE
         calibration = _calibration(self.results)
-        told = [precision, *([] if calibration is None else [calibration[:8]]), *(["random noise"] if noisy else [])]
-        return ", ".join(told)
+        reported = [
+            precision,
+            *([] if calibration is None else [calibration[:8]]),
+            *(["random noise"] if noisy else []),
+        ]
+        return ", ".join(reported)
 
     @property
     def document(self) -> ComparedRun:
@@ -170,9 +174,9 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
         if calibration is None:
             continue
         # a server doesn't tell which weights it has: its configuration's name has to do
-        told = run.policy.identity.get("weights") or _at(run.policy.identity, "server", "config")
+        reported = run.policy.identity.get("weights") or _at(run.policy.identity, "server", "config")
         numbers = format_of(str(run.policy.identity.get("precision"))).label
-        other = first.setdefault(f"{numbers} of {told}", run)
+        other = first.setdefault(f"{numbers} of {reported}", run)
         if _calibration(other) != calibration:
             raise ConfigError(
                 f"{other.folder} and {run.folder} are {numbers} of one model by different calibrations "
@@ -240,8 +244,8 @@ LEGEND = (
 def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     """compare.json, compare.png and compare.html."""
     folder.mkdir(parents=True, exist_ok=True)
-    told = folder / DOCUMENT
-    write_whole(told, json.dumps(plain_document(document(compared)), indent=1, ensure_ascii=False) + "\n")
+    reported = folder / DOCUMENT
+    write_whole(reported, json.dumps(plain_document(document(compared)), indent=1, ensure_ascii=False) + "\n")
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"
     suite = compared[0].results.suite
@@ -258,7 +262,7 @@ def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
         disagreements=_disagreements([run.results for run in compared]),
     )
     write_whole(shown, page)
-    return [told, plot, shown]
+    return [reported, plot, shown]
 
 
 def _disagreements(runs: Sequence[Results]) -> list[tuple[tuple[int, int], list[str | None]]]:

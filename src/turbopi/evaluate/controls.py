@@ -1,4 +1,4 @@
-"""Controls: a policy that is given the wrong prompt, or the wrong pictures, should fail.
+"""Controls: a policy that is given the wrong prompt, or the wrong images, should fail.
 
 If it doesn't, its success doesn't come from what it was told, or from what it saw.
 """
@@ -12,8 +12,8 @@ from turbopi.evaluate.sources import Answer, PolicySource
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
-Control = Literal["prompt", "pictures"]
-CONTROLS: tuple[Control, ...] = ("prompt", "pictures")
+Control = Literal["prompt", "images"]
+CONTROLS: tuple[Control, ...] = ("prompt", "images")
 _GRAY = 128
 
 
@@ -21,7 +21,7 @@ class Controlled:
     """A policy source that hands wrong observations on to another one.
 
     prompt     the instruction of the task after this one (and the first's for the last)
-    pictures   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
+    images   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
                which episodes run side by side, so with several workers a run doesn't repeat exactly.
 
     instructions   of the tasks that are evaluated, in order. Raises ConfigError if there are fewer than two.

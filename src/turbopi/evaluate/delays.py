@@ -12,10 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
-from turbopi.evaluate.pacing import PacedSummary, told_of_lateness
+from turbopi.evaluate.pacing import PacedSummary, allows_for_lateness
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plan import Protocol
-from turbopi.evaluate.results import Episode, Plain, PolicyTold, Results, plain_object
+from turbopi.evaluate.results import Episode, Plain, PolicyDescription, Results, plain_object
 from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
 from turbopi.realtime import WAYS, way_named
 from turbopi.support.errors import ConfigError
@@ -100,7 +100,7 @@ class DelaysDocument(Struct, frozen=True):
 
     format: Literal[1]
     protocol: Plain
-    policy: PolicyTold
+    policy: PolicyDescription
     versions: Plain
     episodes: list[tuple[int, int]]  # task and initial state
     first: str  # the way that the others are compared with
@@ -172,7 +172,7 @@ def document(cells: Sequence[tuple[Cell, Results]]) -> DelaysDocument:
     return DelaysDocument(
         format=FORMAT,
         protocol={name: value for name, value in results.protocol.items() if name not in own},
-        policy=PolicyTold(
+        policy=PolicyDescription(
             results.policy.label, plain_object(results.policy.identity), plain_object(results.policy.about)
         ),
         versions=plain_object(results.versions),
@@ -197,10 +197,10 @@ def write_delays(folder: Path, cells: Sequence[tuple[Cell, Results]]) -> Path:
     if not cells:
         raise ConfigError("there is nothing to report: no way to run was evaluated")
     folder.mkdir(parents=True, exist_ok=True)
-    told = document(cells)
-    write_whole(folder / FILE, json.dumps(plain_document(told), ensure_ascii=False, allow_nan=False) + "\n")
-    plot_success(folder / SUCCESS_PLOT, told.cells)
-    plot_seams(folder / SEAM_PLOT, told.cells)
+    reported = document(cells)
+    write_whole(folder / FILE, json.dumps(plain_document(reported), ensure_ascii=False, allow_nan=False) + "\n")
+    plot_success(folder / SUCCESS_PLOT, reported.cells)
+    plot_seams(folder / SEAM_PLOT, reported.cells)
     results = cells[0][1]
     is_real_time = results.control_hz is not None
     page = render(
@@ -208,11 +208,11 @@ def write_delays(folder: Path, cells: Sequence[tuple[Cell, Results]]) -> Path:
         title=f"{results.suite} under delay: {results.label}",
         suite=results.suite,
         label=results.label,
-        episodes=len(told.episodes),
-        heads=heads(told.cells),
-        notes=notes(told.cells, results.control_hz),
-        rows=[row(cell) for cell in told.cells],
-        legend=LEGEND.format(first=told.first) + (MEASURED_LEGEND if is_real_time else ""),
+        episodes=len(reported.episodes),
+        heads=heads(reported.cells),
+        notes=notes(reported.cells, results.control_hz),
+        rows=[row(cell) for cell in reported.cells],
+        legend=LEGEND.format(first=reported.first) + (MEASURED_LEGEND if is_real_time else ""),
         measured=is_real_time,
         rate=results.rate if is_real_time else "",
         plots=[SUCCESS_PLOT, SEAM_PLOT],
@@ -260,11 +260,11 @@ def heads(cells: Sequence[CellSummary]) -> tuple[str, ...]:
 def notes(cells: Sequence[CellSummary], control_hz: float | None) -> list[str]:
     """What a reader must know before the numbers: where the simulator couldn't keep up with the clock."""
     found = [
-        (cell.execution, told_of_lateness(cell.real_time, control_hz))
+        (cell.execution, allows_for_lateness(cell.real_time, control_hz))
         for cell in cells
         if cell.real_time is not None and control_hz is not None
     ]
-    return [f"{execution}: {told}" for execution, told in found if told is not None]
+    return [f"{execution}: {reported}" for execution, reported in found if reported is not None]
 
 
 def row(cell: CellSummary) -> list[str]:
@@ -301,12 +301,12 @@ def _difference(paired: PairedDocument | None) -> str:
 
 
 def plot_success(path: Path, cells: Sequence[CellSummary]) -> Path:
-    """Success over delay, one line a way to run, one picture an execution horizon; with Wilson's intervals."""
+    """Success over delay, one line a way to run, one image an execution horizon; with Wilson's intervals."""
     horizons = sorted({cell.horizon for cell in cells})
     figure = Figure(figsize=(4.8 * len(horizons) + 0.6, 3.8), layout="constrained")
-    pictures = figure.subplots(1, len(horizons), squeeze=False, sharey=True)[0]
+    camera_images = figure.subplots(1, len(horizons), squeeze=False, sharey=True)[0]
     ways = list(dict.fromkeys(cell.execution for cell in cells))
-    for axes, horizon in zip(pictures, horizons, strict=True):
+    for axes, horizon in zip(camera_images, horizons, strict=True):
         for number, way in enumerate(ways):
             own = [cell for cell in cells if (cell.execution, cell.horizon) == (way, horizon) and cell.success.trials]
             shift = 0.06 * (number - (len(ways) - 1) / 2)  # so that intervals don't hide each other
@@ -321,8 +321,8 @@ def plot_success(path: Path, cells: Sequence[CellSummary]) -> Path:
         _label_delays(axes, cells)
         axes.set_ylim(-2, 103)
         axes.grid(alpha=0.3)
-    pictures[0].set_ylabel("success [%], Wilson's 95 % interval")
-    pictures[-1].legend(fontsize=8, frameon=False)
+    camera_images[0].set_ylabel("success [%], Wilson's 95 % interval")
+    camera_images[-1].legend(fontsize=8, frameon=False)
     write_figure(path, figure, dpi=120)
     return path
 

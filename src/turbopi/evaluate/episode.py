@@ -63,7 +63,7 @@ def run_episode(
     *,
     max_steps: int,
     image_keys: tuple[str, ...],
-    film: Callable[[Frame], None] | None = None,
+    on_frame: Callable[[Frame], None] | None = None,
     smooth: bool = False,
 ) -> Ending:
     """Reset, then ask and act until the task is solved or the steps are used up.
@@ -72,7 +72,7 @@ def run_episode(
     """
     environment.reset(job.initial_state)
     queue = ChunkQueue(execution.way, execution_horizon=execution.horizon, delay=execution.delay)
-    commands, reel = Commands(), Reel(film, smooth)
+    commands, reel = Commands(), Reel(on_frame, smooth)
     answer: Mapping[str, Any] = {}
     due, step, status, message = -1, 0, "failure", None
     refused: np.ndarray | None = None
@@ -82,12 +82,12 @@ def run_episode(
         if arrives:
             queue.arrive(answer)
         if reel.wants(takes_over=arrives) and not queue.wants_observation:
-            reel.picture(step, environment.draw())
+            reel.camera_image(step, environment.draw())
         if queue.wants_observation:
             observation = environment.observation()
             request = queue.observe()
-            reel.picture(step, [observation[key] for key in image_keys])
-            reel.asked(step)
+            reel.camera_image(step, [observation[key] for key in image_keys])
+            reel.requested(step)
             try:
                 answer = ask(step, observation, request.arguments)
             except NoActions as none:
@@ -118,8 +118,8 @@ def run_episode(
         if environment.step(values, look=look):
             status = "success"
             break
-    if film is not None and status != "aborted":
-        reel.picture(step, environment.draw())
+    if on_frame is not None and status != "aborted":
+        reel.camera_image(step, environment.draw())
     reel.end(refused)
     motion = commands.motion(
         execution.dims(commands), queue.seams, standing=queue.empty_steps, dropped=sum(queue.dropped.values())

@@ -66,7 +66,7 @@ class Paced(Struct, frozen=True):
     latency_ms   from an observation to the policy's answer, for each of them: with the pipes on the way
     dropped      chunks that were never carried out, by reason (docs/real_time.md)
     late_ms      of each control step that began late: how late
-    step_ms      the simulator's own time for a step, with its pictures: median and longest
+    step_ms      the simulator's own time for a step, with its images: median and longest
     seconds      from the first control step to the beginning of the last one
     """
 
@@ -125,7 +125,7 @@ def summarise_paced(episodes: Sequence[tuple[int, Paced]], control_hz: float) ->
     )
 
 
-def told_of_lateness(summary: PacedSummary, control_hz: float) -> str | None:
+def allows_for_lateness(summary: PacedSummary, control_hz: float) -> str | None:
     """What a reader must know of control steps that began late; None if none did."""
     if summary.late_ms is None:
         return None
@@ -142,7 +142,7 @@ def told_of_lateness(summary: PacedSummary, control_hz: float) -> str | None:
     return f"NOT REAL TIME. {text} These aren't the delays of a robot at this rate: give a lower --control-hz."
 
 
-def rate_told(control_hz: float, own_hz: float | None) -> str:
+def rate_given(control_hz: float, own_hz: float | None) -> str:
     """How fast the world is: `own_hz` is the rate of the simulator's robot."""
     text = f"{control_hz:g} control steps a second"
     if own_hz is None or control_hz == own_hz:
@@ -151,7 +151,7 @@ def rate_told(control_hz: float, own_hz: float | None) -> str:
     return f"{text}, where the simulator's robot makes {own_hz:g}: {motion} motion"
 
 
-def told_of_pace(summary: PacedSummary, control_hz: float) -> str:
+def knows_pace(summary: PacedSummary, control_hz: float) -> str:
     """The measured delays, in a line."""
     dropped = ", ".join(f"{count} {reason}" for reason, count in summary.dropped.items()) or "none"
     if summary.delay_steps is None or summary.latency_ms is None:

@@ -21,7 +21,7 @@ class Protocol:
     """Everything that decides what happens in an episode, besides the policy. The defaults are openpi's.
 
     replan       actions of a chunk that are carried out before the policy is asked again: the execution horizon
-    image_px     pictures are resized to this square with padding before they are sent to the policy
+    image_px     images are resized to this square with padding before they are sent to the policy
     max_steps    control steps after the wait; None: the suite's own limit
     execution    how chunks join: one of turbopi.realtime.WAYS
     delay        control steps from an observation to the chunk computed from it, simulated
@@ -79,7 +79,7 @@ class Job:
     task: Task
     initial_state: int
     video: str | None = None  # the file's name without its ending, if it is filmed
-    keep_success: bool = False  # whether a film of a success is kept too
+    keep_success: bool = False  # whether a video of a success is kept too
 
     @property
     def key(self) -> tuple[int, int]:

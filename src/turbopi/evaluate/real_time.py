@@ -78,7 +78,7 @@ class RealTimeLoop:
         *,
         max_steps: int,
         image_keys: tuple[str, ...],
-        film: Callable[[Frame], None] | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> Ending:
         """One episode. Its clock starts with the first observation, and the robot stands still until the first chunk.
 
@@ -93,20 +93,20 @@ class RealTimeLoop:
         self._executor.reset()
         first = self._requests
         self._policy.begin_episode(first)
-        commands, reel = Commands(), Reel(film, smooth=False)
+        commands, reel = Commands(), Reel(on_frame, smooth=False)
         step, status, standing, seen = 0, "failure", 0, True
         self._pacer.begin()
         try:
             while step < max_steps:
                 self._pacer.wait()
                 self._policy.check()
-                pictures = self._look(environment, step, reel, image_keys) if seen else []
+                camera_images = self._look(environment, step, reel, image_keys) if seen else []
                 command = self._executor.next_action()
                 if command.takes_over:
                     if len(commands.values) > standing:  # it takes over from another chunk
                         commands.seams.append(step)
-                    if pictures:
-                        reel.picture(step, pictures)
+                    if camera_images:
+                        reel.camera_image(step, camera_images)
                 commands.values.append(self._values(command, commands, reel, first))
                 standing += command.kind != "fresh"
                 step += 1
@@ -118,10 +118,10 @@ class RealTimeLoop:
         finally:  # after a crash, too: an answer that comes later would be taken for the next episode's
             self._inference.begin(lambda: None).result()  # waits until the call that is under way has ended
         self._policy.check()
-        if film is not None:
+        if on_frame is not None:
             for number, chunk in self._policy.chunks.items():
                 reel.answered(number - first, chunk)
-            reel.picture(step, environment.draw())
+            reel.camera_image(step, environment.draw())
         reel.end()
         paced = self._paced(first, seconds)
         seams = [seam for seam in self._executor.seams if seam.chunk >= first]
@@ -139,15 +139,15 @@ class RealTimeLoop:
         self._warm = True
 
     def _look(self, environment: Environment, step: int, reel: Reel, image_keys: tuple[str, ...]) -> list[np.ndarray]:
-        """Give the executor what is seen; the pictures, for a film."""
+        """Give the executor what is seen; the images, for a video."""
         observation = environment.observation()
-        pictures = [observation[key] for key in image_keys]
+        camera_images = [observation[key] for key in image_keys]
         if self._executor.observe({**observation, _STEP: step}):
             self._requests += 1
-            reel.asked(step)
-            reel.picture(step, pictures)
+            reel.requested(step)
+            reel.camera_image(step, camera_images)
             return []
-        return pictures
+        return camera_images
 
     def _values(self, command: Command, commands: Commands, reel: Reel, first: int) -> np.ndarray:
         """What the simulator is commanded."""
@@ -190,13 +190,13 @@ class _Policy:
     def infer(
         self, observation: Mapping[str, Any], *, previous: Any = None, model_actions: bool = False
     ) -> Mapping[str, Any]:
-        asked = dict(observation)
-        step = asked.pop(_STEP, None)
+        requested = dict(observation)
+        step = requested.pop(_STEP, None)
         arguments = {"previous": previous, "model_actions": True} if model_actions else {}
         began = self._clock()
         number, self._next = self._next, self._next + (step is not None)
         try:
-            result = self._ask(step, asked, arguments)
+            result = self._ask(step, requested, arguments)
         except NoActions:
             raise
         except BaseException as error:

@@ -47,7 +47,7 @@ class Played:
 def play(
     source: LocalPolicy, way: str, delay: int, episodes: int, *, px: int, seed: int, tick: Callable[[], None]
 ) -> Played:
-    """The simulator's first initial states, one after the other; pictures are drawn in the model's size."""
+    """The simulator's first initial states, one after the other; images are drawn in the model's size."""
     simulator = create(SIMULATOR)
     settings = SimSettings(seed=seed, camera_px=px)
     task = simulator.tasks(simulator.suites[0])[0]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from turbopi.evaluate.pacing import told_of_lateness
+from turbopi.evaluate.pacing import allows_for_lateness
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_plots
 from turbopi.evaluate.results import Episode, Results, Summary, rate
@@ -46,7 +46,7 @@ def _notes(results: Results, summary: Summary) -> list[str]:
     if results.policy.about.get("random_weights"):
         notes.append("Random weights: the actions mean nothing.")
     if summary.real_time is not None and results.control_hz is not None:
-        late = told_of_lateness(summary.real_time, results.control_hz)
+        late = allows_for_lateness(summary.real_time, results.control_hz)
         notes.append(f"In real time, {results.rate}: delays are measured by the wall clock.")
         notes += [] if late is None else [late]
     if not results.complete:

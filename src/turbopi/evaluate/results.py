@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from turbopi.evaluate.motion import Motion
-from turbopi.evaluate.pacing import Paced, PacedSummary, rate_told, summarise_paced
+from turbopi.evaluate.pacing import Paced, PacedSummary, rate_given, summarise_paced
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.statistics import Percentiles, Rate, RateDocument, percentiles
 from turbopi.sim import Task
@@ -43,7 +43,7 @@ class Episode(Struct, frozen=True):
     infer_ms     the model's part of it, where the policy tells
     batch        for each of these calls, the requests that were answered together
     message      what the simulator or the policy said, if it isn't a plain success or failure
-    video        the film's path in the run's folder
+    video        the video's path in the run's folder
     motion       how smooth the commands were; None in files of 0.1
     real_time    what the wall clock showed, where the world advanced with it
     """
@@ -81,7 +81,7 @@ def rate(episodes: Iterable[Episode]) -> Rate:
     return Rate(sum(episode.success for episode in judged), len(judged))
 
 
-class PolicyTold(Struct, frozen=True, omit_defaults=True):
+class PolicyDescription(Struct, frozen=True, omit_defaults=True):
     """What was evaluated. `identity` decides whether a run may be continued; `about` is for the report."""
 
     label: str | None = None  # None: the folder's name
@@ -118,7 +118,7 @@ class RunDocument(Struct, frozen=True):
     format: Literal[1]
     complete: bool
     protocol: Plain  # `Protocol`; other versions' may have other fields, which then tell two runs apart
-    policy: PolicyTold
+    policy: PolicyDescription
     versions: Plain  # the simulator's, and `Provenance` of the machine that ran it
     options: Plain  # what doesn't change outcomes: workers, batches, videos
     started: Text  # ISO 8601, UTC
@@ -134,7 +134,13 @@ class Results:
     """A run's episodes and what they were run with, in a folder."""
 
     def __init__(
-        self, folder: Path, protocol: Plain, policy: PolicyTold, tasks: Sequence[Task], versions: Plain, options: Plain
+        self,
+        folder: Path,
+        protocol: Plain,
+        policy: PolicyDescription,
+        tasks: Sequence[Task],
+        versions: Plain,
+        options: Plain,
     ) -> None:
         self.folder = folder
         self.protocol, self.policy, self.versions, self.options = protocol, policy, versions, options
@@ -224,7 +230,7 @@ class Results:
         """How fast the world of a run in real time was."""
         assert self.control_hz is not None
         own = self.options.get(OWN_HZ)
-        return rate_told(self.control_hz, float(own) if isinstance(own, int | float) else None)
+        return rate_given(self.control_hz, float(own) if isinstance(own, int | float) else None)
 
     def real_time(self) -> PacedSummary | None:
         """What the wall clock showed; None if the world waited for the policy."""
@@ -234,7 +240,9 @@ class Results:
         return summarise_paced(paced, self.control_hz)
 
     def document(self) -> RunDocument:
-        about = PolicyTold(self.policy.label, plain_object(self.policy.identity), plain_object(self.policy.about))
+        about = PolicyDescription(
+            self.policy.label, plain_object(self.policy.identity), plain_object(self.policy.about)
+        )
         return RunDocument(
             format=FORMAT,
             complete=self.complete,

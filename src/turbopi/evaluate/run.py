@@ -14,7 +14,7 @@ from turbopi.evaluate.plan import Job, Protocol, VideoPlan
 from turbopi.evaluate.reading import check_is_run, load_results
 from turbopi.evaluate.report import FILE as REPORT
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import FILE, OWN_HZ, Episode, PolicyTold, Results, protocol_json
+from turbopi.evaluate.results import FILE, OWN_HZ, Episode, PolicyDescription, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
 from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
@@ -48,7 +48,7 @@ def prepare(
     if folder.is_dir():
         with _alone(folder):  # `evaluate` needs to be; who can't be should know before it is prepared
             pass
-    policy = PolicyTold(source.label, source.identity, source.about)
+    policy = PolicyDescription(source.label, source.identity, source.about)
     with faults_named(simulator, "versions()"):
         own = simulator.versions()
     versions = {"simulator": own, **plain_document(provenance(torch.device("cpu")))}
@@ -147,7 +147,7 @@ def _clear(folder: Path) -> None:
     for name in (FILE, LOG, REPORT, "success.png", "steps.png", "latency.png", "visited.npz"):
         with contextlib.suppress(FileNotFoundError):
             (folder / name).unlink()
-    for film in (folder / "videos").glob("task*_state*_*.mp4"):
-        film.unlink()
+    for on_frame in (folder / "videos").glob("task*_state*_*.mp4"):
+        on_frame.unlink()
     with contextlib.suppress(OSError):
         (folder / "videos").rmdir()

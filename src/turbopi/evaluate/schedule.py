@@ -140,9 +140,9 @@ class Scheduler:
         for one in ready:
             worker = by_connection[one]  # type: ignore[index]
             self._handle(worker, worker.receive())
-        asking = {request.worker for request in self._requests}
+        requesting = {request.worker for request in self._requests}
         for worker in tuple(self._running):
-            if worker not in asking and time.monotonic() - worker.heard > SILENCE_S:
+            if worker not in requesting and time.monotonic() - worker.heard > SILENCE_S:
                 self._lost(worker, f"the simulator said nothing for {SILENCE_S:.0f} s and was ended")
 
     def _handle(self, worker: WorkerHandle, message: tuple[Any, ...]) -> None:
@@ -196,7 +196,7 @@ class Scheduler:
     ) -> None:
         job, worker.job = worker.job, None
         assert job is not None
-        told = self._running[worker]
+        reported = self._running[worker]
         seed = self._protocol.sim.episode_seed(job.task.index, job.initial_state)
         episode = Episode(
             task=job.task.index,
@@ -205,9 +205,9 @@ class Scheduler:
             steps=steps,
             seed=seed,
             seconds=round(seconds, 2),
-            call_ms=[round(ms, 3) for ms in told.call_ms],
-            infer_ms=[round(ms, 3) for ms in told.infer_ms],
-            batch=told.batch,
+            call_ms=[round(ms, 3) for ms in reported.call_ms],
+            infer_ms=[round(ms, 3) for ms in reported.infer_ms],
+            batch=reported.batch,
             message=None if message is None else writable(message),
             video=video,
             motion=motion,
@@ -251,11 +251,11 @@ class Scheduler:
         call_ms = (time.perf_counter() - start) * 1e3
         for request, answer in zip(batch, answers, strict=True):
             if request.step is not None:
-                told = self._running[request.worker]
-                told.call_ms.append(call_ms)
-                told.batch.append(len(batch))
+                reported = self._running[request.worker]
+                reported.call_ms.append(call_ms)
+                reported.batch.append(len(batch))
                 if answer.infer_ms is not None:
-                    told.infer_ms.append(answer.infer_ms)
+                    reported.infer_ms.append(answer.infer_ms)
             request.worker.heard = time.monotonic()
             if answer.problem is not None:
                 reply: tuple[str, object] = ("problem", answer.problem)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from turbopi.policy.call_options import MAX_BATCH
-from turbopi.quantization.formats import told_by
+from turbopi.quantization.formats import named_by
 from turbopi.realtime.messages import PREFIX, message
 from turbopi.realtime.queue import of_batch
 from turbopi.realtime.running_chunk import JoinMode
@@ -22,7 +22,7 @@ CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
 BAD_ACTIONS = "bad actions: "  # begins a Turbo-Pi server's answer where the model computed NaN or infinity
 MAX_MS = 1e12
-MAX_TOLD = 10_000  # numbers of an array in a server's metadata
+MAX_REPORTED = 10_000  # numbers of an array in a server's metadata
 
 
 class PolicyLost(TurboPiError):
@@ -113,13 +113,13 @@ class LocalPolicy:
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        told = [{}] * len(observations) if arguments is None else arguments
+        reported = [{}] * len(observations) if arguments is None else arguments
         try:
-            results = self._policy.infer_batch(list(observations), seed=list(seeds), **of_batch(told))
+            results = self._policy.infer_batch(list(observations), seed=list(seeds), **of_batch(reported))
         except ActionError as error:
             if len(observations) == 1:
                 return [Answer.unusable(str(error))]
-            each = zip(observations, seeds, told, strict=True)  # the others' actions are good
+            each = zip(observations, seeds, reported, strict=True)  # the others' actions are good
             return [self.infer([observation], [seed], [more])[0] for observation, seed, more in each]
         return [replace(_answer(result, "policy_timing"), for_next=_for_next(result)) for result in results]
 
@@ -134,16 +134,16 @@ class LocalPolicy:
             arguments["real_time"] = mode
         if not arguments:
             return
-        asked = ([] if most == 1 else [f"batches of up to {most}"]) + ([] if mode is None else [f"mode {mode}"])
-        tell(f"Warming up {', '.join(asked)} …")
+        requested = ([] if most == 1 else [f"batches of up to {most}"]) + ([] if mode is None else [f"mode {mode}"])
+        tell(f"Warming up {', '.join(requested)} …")
         try:
             seconds = self._policy.warmup(**arguments)
         except torch.OutOfMemoryError as error:
             if most == 1:
                 raise
             raise ConfigError(
-                f"warm-up of {', '.join(asked)} takes more than the GPU's memory: {error}. Give a smaller --max-batch, "
-                "or fewer --workers"
+                f"warm-up of {', '.join(requested)} takes more than the GPU's memory: {error}. Give a smaller "
+                "--max-batch, or fewer --workers"
             ) from error
         tell(f"warm-up: {seconds:.2f} s")
 
@@ -153,14 +153,14 @@ class LocalPolicy:
 
 def calibration_of(metadata: Mapping[str, object]) -> str | None:
     """Which calibration a policy runs with (`Quantization.identity`), where its metadata tells; None: it has none."""
-    identity = (told_by(metadata.get("backend_details")) or {}).get("identity")
+    identity = (named_by(metadata.get("backend_details")) or {}).get("identity")
     return identity if isinstance(identity, str) else None
 
 
 def offered(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     """What a policy's metadata says of chunks that join; empty if it says nothing."""
-    told = metadata.get("real_time")
-    return told if isinstance(told, Mapping) else {}
+    reported = metadata.get("real_time")
+    return reported if isinstance(reported, Mapping) else {}
 
 
 class RemotePolicy:
@@ -198,7 +198,7 @@ class RemotePolicy:
                 "then give the same command again: finished episodes are kept"
             ) from error
         try:
-            metadata = _told(_unpacked(self._socket.greeting, self._where), self._where)
+            metadata = _reported(_unpacked(self._socket.greeting, self._where), self._where)
         except PolicyRefused:
             self.close()
             raise
@@ -219,10 +219,10 @@ class RemotePolicy:
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        told = arguments if arguments is not None else [{}] * len(observations)
+        reported = arguments if arguments is not None else [{}] * len(observations)
         return [
             self._one(message(observation, **more, seed=seed if self.takes_seeds else None))
-            for observation, seed, more in zip(observations, seeds, told, strict=True)
+            for observation, seed, more in zip(observations, seeds, reported, strict=True)
         ]
 
     def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
@@ -231,11 +231,11 @@ class RemotePolicy:
     def close(self) -> None:
         self._socket.close()
 
-    def _one(self, asked: dict[str, Any]) -> Answer:
+    def _one(self, requested: dict[str, Any]) -> Answer:
         from websockets.exceptions import WebSocketException
 
         try:
-            reply = self._socket.ask(pack(asked), ANSWER_S)
+            reply = self._socket.ask(pack(requested), ANSWER_S)
         except (OSError, WebSocketException) as error:
             raise PolicyLost(
                 f"the policy server at {self._where} went away: {_reason(error)}. What was finished is kept: start the "
@@ -278,23 +278,23 @@ def _answer(result: object, *timings: str) -> Answer:
 
 def _milliseconds(result: Mapping[str, object], timing: str) -> float | None:
     """How long the model took, as a part of the answer tells it; None if it doesn't."""
-    told = result.get(timing)
-    if told is None or not isinstance(told, Mapping) or told.get("infer_ms") is None:
+    reported = result.get(timing)
+    if reported is None or not isinstance(reported, Mapping) or reported.get("infer_ms") is None:
         return None
-    value = told["infer_ms"].item() if isinstance(told["infer_ms"], np.generic) else told["infer_ms"]
+    value = reported["infer_ms"].item() if isinstance(reported["infer_ms"], np.generic) else reported["infer_ms"]
     if not is_finite(value) or not 0 <= value <= MAX_MS:
         raise PolicyRefused(f"the policy's {timing} says infer_ms = {shown(value)}; expected milliseconds")
     return float(value)
 
 
-def _told(value: Any, where: str, key: str = "metadata") -> Any:
+def _reported(value: Any, where: str, key: str = "metadata") -> Any:
     """What a server tells of itself, as JSON has it. Raises PolicyRefused, with the key, for what JSON hasn't."""
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "fiubU" and value.size <= MAX_TOLD:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "fiubU" and value.size <= MAX_REPORTED:
         value = value.tolist()
     if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
-        return {name: _told(item, where, f"{key}.{name}") for name, item in value.items()}
+        return {name: _reported(item, where, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, list):
-        return [_told(item, where, key) for item in value]
+        return [_reported(item, where, key) for item in value]
     if value is None or isinstance(value, str | bool) or is_finite(value):
         return value
     raise PolicyRefused(

@@ -60,18 +60,18 @@ def write_video(path: Path, frames: Sequence[Frame], caption: str, ending: str, 
         with imageio.get_writer(temporary, **options) as writer:
             for number, frame in enumerate(frames):
                 last = number == len(frames) - 1
-                picture = draw_frame(frame, caption, groups, ending if last else None, delayed=delayed)
+                camera_image = draw_frame(frame, caption, groups, ending if last else None, delayed=delayed)
                 times = 1 if last else math.ceil(shown[number] / unit)
                 for _ in range(times * repeats + (round(END_S * fps) if last else 0)):
-                    writer.append_data(picture)
+                    writer.append_data(camera_image)
         if not _is_finished(temporary):  # imageio doesn't tell that ffmpeg has failed
             raise OutputError(f"can't write {path}: ffmpeg could not finish it; is there room?")
 
 
-def _is_finished(film: Path) -> bool:
+def _is_finished(on_frame: Path) -> bool:
     """Whether an MP4 has all of its boxes, among them the index, which comes last. (ISO/IEC 14496-12, 4.2)"""
-    size, at, kinds = film.stat().st_size, 0, set()
-    with film.open("rb") as stream:
+    size, at, kinds = on_frame.stat().st_size, 0, set()
+    with on_frame.open("rb") as stream:
         while at + 8 <= size:
             stream.seek(at)
             length, kind = struct.unpack(">I4s", stream.read(8))
@@ -99,8 +99,8 @@ def draw_frame(
     *,
     delayed: bool = False,
 ) -> np.ndarray:
-    """One frame of a film: uint8[h, w, 3], both even. `delayed`: the film's chunks took over after a delay."""
-    width = len(frame.pictures) * VIEW + (len(frame.pictures) + 1) * MARGIN
+    """One frame of a video: uint8[h, w, 3], both even. `delayed`: the video's chunks took over after a delay."""
+    width = len(frame.camera_images) * VIEW + (len(frame.camera_images) + 1) * MARGIN
     lines = textwrap.wrap(caption, width=max(20, width // 9))
     top = MARGIN + 22 * len(lines) + 6
     legend = [LEGEND, DELAYED] if delayed else [LEGEND]
@@ -110,8 +110,8 @@ def draw_frame(
     draw = ImageDraw.Draw(image)
     for number, line in enumerate(lines):
         draw.text((MARGIN, MARGIN - 4 + 22 * number), line, fill=INK, font=_font(17))
-    for number, picture in enumerate(frame.pictures):
-        view = Image.fromarray(picture).resize((VIEW, VIEW), Image.Resampling.BILINEAR)
+    for number, camera_image in enumerate(frame.camera_images):
+        view = Image.fromarray(camera_image).resize((VIEW, VIEW), Image.Resampling.BILINEAR)
         image.paste(view, (MARGIN + number * (VIEW + MARGIN), top))
     _tag(draw, (MARGIN + 8, top + 8), f"step {frame.step}", INK)
     if frame.note:

@@ -47,10 +47,10 @@ class Worker:
                 video = self._write_video(job, frames, ending.status)
             except OSError as error:  # a full disk, no ffmpeg: the verdict stands
                 message = f"{message or ''} the video couldn't be written: {error}".strip()
-        told = (ending.status, ending.steps, message, seconds, video, ending.motion, ending.paced)
-        self.connection.send(("finished", *told))
+        reported = (ending.status, ending.steps, message, seconds, video, ending.motion, ending.paced)
+        self.connection.send(("finished", *reported))
 
-    def _episode(self, job: Job, film: Callable[[Frame], None] | None) -> Ending:
+    def _episode(self, job: Job, on_frame: Callable[[Frame], None] | None) -> Ending:
         setup, environment = self.setup, self._environment(job.task.index)
         execution = Execution(
             setup.execution,
@@ -65,13 +65,13 @@ class Worker:
                 *(environment, job, self._ask, execution),
                 max_steps=most,
                 image_keys=keys,
-                film=film,
+                on_frame=on_frame,
                 smooth=setup.smooth,
             )
         if self.loop is None:
             width = self.simulator.action_dim
             self.loop = RealTimeLoop(self._ask, setup.offered, execution, setup.control_hz, action_dim=width)
-        return self.loop.run(environment, job, max_steps=most, image_keys=keys, film=film)
+        return self.loop.run(environment, job, max_steps=most, image_keys=keys, on_frame=on_frame)
 
     def _write_video(self, job: Job, frames: list[Frame], status: str) -> str:
         """Its path inside the results' folder."""

@@ -22,10 +22,10 @@ PILLOW_BITS = 22  # of the fraction of its weights: 32 less 8 of a pixel and 2 t
 
 @dataclass(frozen=True)
 class Taps:
-    """One axis of a picture resized: number i of the result is made of `weights[i]` times those from `first[i]` on.
+    """One axis of an image resized: number i of the result is made of `weights[i]` times those from `first[i]` on.
 
     first      int32[n]
-    weights    int32[n, taps], in units of 2^-22 (Pillow), or float32[n, 2]. Beyond the picture its last number counts,
+    weights    int32[n, taps], in units of 2^-22 (Pillow), or float32[n, 2]. Beyond the image its last number counts,
                with a weight of 0 but for float32
     """
 
@@ -33,11 +33,11 @@ class Taps:
     weights: Tensor
 
 
-# What `resize_pictures` is told of each camera's picture: int64[len(SOURCE)] in the device's memory, so that a captured
-# graph takes pictures of any size. Addresses of the picture uint8[height, width, 3] and of its `Taps`; sizes; where in
+# What `resize_pictures` is told of each camera's image: int64[len(SOURCE)] in the device's memory, so that a captured
+# graph takes images of any size. Addresses of the image uint8[height, width, 3] and of its `Taps`; sizes; where in
 # the result it begins, and how much of it it fills (no rows: the result stays as it is); `kernels.plain`'s `low`.
 SOURCE = (
-    *("picture", "x_first", "x_weights", "y_first", "y_weights"),
+    *("image", "x_first", "x_weights", "y_first", "y_weights"),
     *("width", "height", "x_taps", "y_taps", "top", "left", "rows", "columns", "low"),
 )
 
@@ -120,7 +120,7 @@ class Ops:
     add_linear: Callable[..., bool] | None = None
     vision: VisionOps | None = None  # None: `forward.VisionByOps` of these operations
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
-    resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
+    resize_images: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     # by the expert's sizes, the number of its tokens, and whether keys are hidden from some of them (`Expert.hidden`);
     # None: `kernels.backward.PLAIN_BACKWARD`
     backward: "Callable[..., BackwardOps] | None" = None

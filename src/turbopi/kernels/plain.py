@@ -28,8 +28,8 @@ def transfer(source: Tensor, to: Tensor) -> None:
     to.copy_(source, non_blocking=True)
 
 
-def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
-    """Picture uint8[h, w, 3] into `out` [S, S, 3], from row `top` and column `left` on; around it is padding.
+def resize_image(image: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
+    """Image uint8[h, w, 3] into `out` [S, S, 3], from row `top` and column `left` on; around it is padding.
 
     out uint8     as Pillow: sums of whole numbers across, rounded to 8 bits, then down; padding 0
     out float32   as LeRobot, in [-1, 1]: two neighbours across, then down, of numbers in [0, 1], each pair with one
@@ -38,10 +38,10 @@ def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top:
     out.fill_(0 if out.dtype == torch.uint8 else 2 * low - 1)
     place = out[top : top + len(rows.first), left : left + len(columns.first)]
     if out.dtype == torch.uint8:
-        across = _pillow_sum(picture.transpose(0, 1), columns).transpose(0, 1)
+        across = _pillow_sum(image.transpose(0, 1), columns).transpose(0, 1)
         place.copy_(_pillow_sum(across, rows))
     else:
-        across = _linear_sum((picture.float() / 255).transpose(0, 1), columns).transpose(0, 1)
+        across = _linear_sum((image.float() / 255).transpose(0, 1), columns).transpose(0, 1)
         place.copy_(_linear_sum(across, rows).clamp(low, 1) * 2 - 1)
 
 
@@ -63,14 +63,14 @@ def _linear_sum(x: Tensor, taps: Taps) -> Tensor:
 
 
 def patch_rows(images: Tensor, patch: int) -> Tensor:
-    """Pictures (uint8|float32)[V, S, S, 3] -> their patches in [-1, 1], float32[V * tokens, 3 * patch * patch]."""
+    """Images (uint8|float32)[V, S, S, 3] -> their patches in [-1, 1], float32[V * tokens, 3 * patch * patch]."""
     n, side = images.shape[0], images.shape[1] // patch
     rows = normalize_images(images).reshape(n, side, patch, side, patch, 3).permute(0, 1, 3, 5, 2, 4)
     return rows.reshape(n * side * side, -1)
 
 
 def embed_patches(images: Tensor, weight: Tensor, position: Tensor, dtype: torch.dtype) -> Tensor:
-    """Pictures (uint8|float32)[V, S, S, 3] -> [V * tokens, W] in `dtype`, computed in float32.
+    """Images (uint8|float32)[V, S, S, 3] -> [V * tokens, W] in `dtype`, computed in float32.
 
     weight float32[W, 3 * patch * patch]; position float32[tokens, W] has the bias in it.
     """
@@ -215,7 +215,7 @@ def vision_attention(
     numbers: torch.dtype = E4M3,
     stream: Tensor | None = None,
 ) -> Tensor:
-    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
+    """Self-attention inside each image: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
     attended = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)

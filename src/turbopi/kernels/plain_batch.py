@@ -12,13 +12,13 @@ from turbopi.kernels.plain import as_input, matmul_f32, residual_rms_norm, rope_
 from turbopi.quantization.fp8 import E4M3
 
 
-def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> None:
-    """Prefix rows into `out` [R, D]: of source int64[R] >= 0 that row of `pictures`, of others that of `table` [vocab,
+def embed_rows(source: Tensor, images: Tensor, table: Tensor, out: Tensor) -> None:
+    """Prefix rows into `out` [R, D]: of source int64[R] >= 0 that row of `images`, of others that of `table` [vocab,
     D] for the token -1 - source, times √D and rounded to its dtype.
     """
     prompt = table[(-1 - source).clamp(min=0)]
     prompt = (prompt.float() * table.shape[1] ** 0.5).to(out.dtype)
-    seen = pictures[source.clamp(min=0)] if len(pictures) else prompt
+    seen = images[source.clamp(min=0)] if len(images) else prompt
     out.copy_(torch.where((source >= 0)[:, None], seen, prompt))
 
 

@@ -14,7 +14,7 @@ class ModelInputs:
     """One preprocessed observation, on the host, without a batch axis.
 
     images      (uint8|float32)[C, 224, 224, 3]  RGB; uint8 in [0, 255], float32 in [-1, 1]
-    image_mask  bool[C]                          False: the camera is missing and its picture is ignored
+    image_mask  bool[C]                          False: the camera is missing and its image is ignored
     tokens      int64[P]                         prompt ids, padded with 0
     token_mask  bool[P]
     state       float32[action_dim]              normalised and zero-padded; only Pi0 reads it
@@ -74,7 +74,7 @@ class Observation:
 
 
 def with_cameras(inputs: ModelInputs, count: int) -> ModelInputs:
-    """The same inputs with `count` valid cameras, the first ones; pictures that aren't there are black."""
+    """The same inputs with `count` valid cameras, the first ones; images that aren't there are black."""
     images, slots = inputs.images, max(count, len(inputs.image_mask))
     padded = np.concatenate((images, np.zeros((slots - len(images), *images.shape[1:]), images.dtype)))
     return dataclasses.replace(inputs, images=padded, image_mask=np.arange(slots) < count)

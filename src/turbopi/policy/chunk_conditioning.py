@@ -50,7 +50,7 @@ class Joins:
         return FORMS[chunk.mode]
 
 
-class Joining:
+class ChunkConditioning:
     """Of one policy; `backend` is its own or its class, `integration` how it denoises unless a call says otherwise.
 
     Raises ConfigError for an integration that the backend doesn't have.
@@ -162,7 +162,7 @@ class Joining:
         num_steps     of those of `others` that don't say
         integrations  of so many steps
         """
-        asked: list[tuple[int, int, Conditioning | None]] = [
+        requested: list[tuple[int, int, Conditioning | None]] = [
             (*loop, integrated(None, integrations(loop[0]))) for loop in loops
         ]
         for mode in [modes] if isinstance(modes, str) else modes:
@@ -171,7 +171,7 @@ class Joining:
                     f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
                 )
             for loop in loops:
-                asked.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
+                requested.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
         for one in others:
             steps, horizon = one.size(num_steps, self._model.action_horizon)
             try:
@@ -181,8 +181,8 @@ class Joining:
                 self._check_form(one.form)
             except ObservationError as error:
                 raise ConfigError(f"warm-up: {error}") from None
-            asked.append((steps, horizon, one))
-        return asked
+            requested.append((steps, horizon, one))
+        return requested
 
     def _check_form(self, form: Form) -> None:
         if (why := self._backend.refuses_form(form)) is not None:

@@ -15,7 +15,7 @@ import torch
 from turbopi import backends
 from turbopi.backends.device_lost import Guard
 from turbopi.models.observation import Observation
-from turbopi.policy.chunk_conditioning import Joining, Joins
+from turbopi.policy.chunk_conditioning import ChunkConditioning, Joins
 from turbopi.preprocess.pipeline import Pipeline
 
 
@@ -25,7 +25,7 @@ class Ran:
 
     sample: backends.Sample
     states: list[np.ndarray]  # of each observation, as the pipeline's `after` takes it
-    asked: float  # the inputs are ready, but for what is done beside the device
+    requested: float  # the inputs are ready, but for what is done beside the device
     infer_start: float  # other threads' calls are over
     infer_end: float
 
@@ -33,8 +33,10 @@ class Ran:
 class ModelCall:
     """Of one policy, by the backend that it holds. One call at a time: others wait for `lock`."""
 
-    def __init__(self, pipeline: Pipeline, joining: Joining, backend: backends.Backend, guard: Guard) -> None:
-        self._pipeline, self._joining, self._backend, self._guard = pipeline, joining, backend, guard
+    def __init__(
+        self, pipeline: Pipeline, conditioning: ChunkConditioning, backend: backends.Backend, guard: Guard
+    ) -> None:
+        self._pipeline, self._conditioning, self._backend, self._guard = pipeline, conditioning, backend, guard
         self.lock = threading.Lock()
 
     def run(
@@ -48,24 +50,24 @@ class ModelCall:
             return self._begin(observations, joins, noise)
         prepared = [self._pipeline.before(obs) for obs in observations]
         inputs, states = Observation.stack([one for one, _ in prepared]), [state for _, state in prepared]
-        x_1, conditioning = torch.from_numpy(noise()), self._joining.conditioning(joins, states)
-        asked = time.perf_counter()
+        x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states)
+        requested = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
             sample = self._backend.sample(inputs, x_1, joins.steps, conditioning=conditioning)
-            return Ran(sample, states, asked, infer_start, time.perf_counter())
+            return Ran(sample, states, requested, infer_start, time.perf_counter())
 
     def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
         each = [self._pipeline.see(obs, resize=False) for obs in observations]
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
-            images, resize = [seen.pictures for seen in each], self._pipeline.config.image_resize
+            images, resize = [seen.camera_images for seen in each], self._pipeline.config.image_resize
             begun = self._backend.begin_batch(images, resize, joins.forms)
             for seen in each:
                 self._pipeline.read(seen)  # while the device is at the first ones' images
             x_1, states = noise(), [seen.state for seen in each]
-            conditioning = self._joining.conditioning(joins, states)
+            conditioning = self._conditioning.conditioning(joins, states)
             tokens, state = [seen.tokens[seen.token_mask] for seen in each], np.stack([one.model_state for one in each])
             sample = begun.finish(tokens, state, x_1, joins.steps, conditioning)
-            return Ran(sample, states, asked, infer_start, time.perf_counter())
+            return Ran(sample, states, requested, infer_start, time.perf_counter())

@@ -32,7 +32,7 @@ from turbopi.policy.call_options import (
     several,
     warm_loops,
 )
-from turbopi.policy.chunk_conditioning import Joining, flags, of_each
+from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.model_call import ModelCall
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -130,8 +130,8 @@ class UnifiedPolicy:
                 name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
-        self._joining = Joining(self.config, self._pipeline, self.backend, self._denoising.integration)
-        self._call = ModelCall(self._pipeline, self._joining, self.backend, self._guard)
+        self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
+        self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard)
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint
@@ -184,8 +184,8 @@ class UnifiedPolicy:
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
         joined = of_each("previous", [previous], 1, RunningChunk)
-        asked = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
-        return self._infer([obs], noises, seed, asked, horizon, own, joined, [model_actions])[0]
+        requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
+        return self._infer([obs], noises, seed, requested, horizon, own, joined, [model_actions])[0]
 
     def infer_batch(
         self,
@@ -216,9 +216,12 @@ class UnifiedPolicy:
         rows = len(observations)
         own = of_each("conditioning", conditioning, rows, Conditioning)
         bringing = next((one for one in own if one is not None and one.brings_steps), None)
-        asked = self._denoising.of_call(num_steps, solver, time_grid, bringing)
-        joined, told = of_each("previous", previous, rows, RunningChunk), flags("model_actions", model_actions, rows)
-        return self._infer(observations, noise, seed, asked, horizon, own, joined, told)
+        requested = self._denoising.of_call(num_steps, solver, time_grid, bringing)
+        joined, reported = (
+            of_each("previous", previous, rows, RunningChunk),
+            flags("model_actions", model_actions, rows),
+        )
+        return self._infer(observations, noise, seed, requested, horizon, own, joined, reported)
 
     def _infer(
         self,
@@ -237,7 +240,7 @@ class UnifiedPolicy:
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
-        joins = self._joining.checked(conditionings, previous, steps, actions, denoising.integration)
+        joins = self._conditioning.checked(conditionings, previous, steps, actions, denoising.integration)
         ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
         chunks = ran.sample.actions.numpy()
         results = self._pipeline.after_all(chunks, ran.states)
@@ -246,7 +249,7 @@ class UnifiedPolicy:
                 result["model_actions"] = chunks[row].copy()
                 if (anchor := self._pipeline.anchor(ran.states[row])) is not None:
                     result["anchor"] = anchor
-        timing = ran.sample.timing(start, ran.asked, ran.infer_start, ran.infer_end, time.perf_counter())
+        timing = ran.sample.timing(start, ran.requested, ran.infer_start, ran.infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
 
     def submit(
@@ -273,7 +276,7 @@ class UnifiedPolicy:
         actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
         inputs, state = self._pipeline.before(obs)
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         with self._guard:
             running = self.backend.submit(Observation.stack([inputs]), x_1, steps)
         answer: Future[dict[str, Any]] = Future()
@@ -287,8 +290,8 @@ class UnifiedPolicy:
                     raise
                 infer_end = time.perf_counter()
                 result = self._pipeline.after_all(sample.actions.numpy(), [state])[0]
-                infer_start = asked + sample.queue_ms / 1e3
-                timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
+                infer_start = requested + sample.queue_ms / 1e3
+                timing = sample.timing(start, requested, infer_start, infer_end, time.perf_counter())
                 answer.set_result(result | {"policy_timing": timing})
             except BaseException as error:
                 answer.set_exception(error)
@@ -338,8 +341,8 @@ class UnifiedPolicy:
             several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
         )
         of_steps = {n: self._denoising.changed(n, None, None, ConfigError).integration for n, _ in loops}
-        asked = self._joining.to_warm(loops, real_time, conditioning, self._denoising.steps, of_steps.get)
-        plan = [(count, *one) for count in counts for one in asked]
+        requested = self._conditioning.to_warm(loops, real_time, conditioning, self._denoising.steps, of_steps.get)
+        plan = [(count, *one) for count in counts for one in requested]
         with self._call.lock, self._guard:
             for i, (count, num_steps, horizon, one) in enumerate(plan):
                 seen = inputs if count == own else with_cameras(inputs, count)
@@ -385,13 +388,13 @@ class UnifiedPolicy:
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:
         """Modes of `RunningChunk`s with which `infer_batch` runs observations together."""
-        return self._joining.modes if self.runs_batches else ()
+        return self._conditioning.modes if self.runs_batches else ()
 
     @property
     def loop_arguments(self) -> dict[str, Any]:
         """This policy's solver and time grid, as arguments of the backend's own methods; empty for openpi's."""
-        asked = self._denoising.integration
-        return {} if asked is None else {"conditioning": Conditioning(integration=asked)}
+        requested = self._denoising.integration
+        return {} if requested is None else {"conditioning": Conditioning(integration=requested)}
 
     @property
     def pipelined(self) -> bool:
@@ -423,7 +426,7 @@ class UnifiedPolicy:
             "random_weights": self._checkpoint.format == "random",
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
-            "real_time": {"modes": list(self._joining.modes), **dataclasses.asdict(self.config.real_time)},
+            "real_time": {"modes": list(self._conditioning.modes), **dataclasses.asdict(self.config.real_time)},
             **self._loading,
             **self._pipeline.metadata,
         }

@@ -1,4 +1,4 @@
-"""What comes with Turbo-Pi: pictures and statistics of LIBERO episodes, and a small trained policy."""
+"""What comes with Turbo-Pi: images and statistics of LIBERO episodes, and a small trained policy."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from turbopi.checkpoint import Checkpoint, load_norm_stats
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import TurboPiError
-from turbopi.support.reading.images import read_picture
+from turbopi.support.reading.images import read_image
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ CHASE_POLICY = Path(__file__).parents[1] / "data" / "chase_policy"  # of the dyn
 
 
 def load_frames(folder: Path = FRAMES) -> list[Frame]:
-    """The pictures that come with Turbo-Pi, or those of another folder of the same form (frames.json names them)."""
+    """The images that come with Turbo-Pi, or those of another folder of the same form (frames.json names them)."""
     try:
         listed = json.loads((folder / "frames.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise TurboPiError(f"{folder} has no frames.json: the installation lacks the demo's pictures") from None
+        raise TurboPiError(f"{folder} has no frames.json: the installation lacks the demo's images") from None
     return [
         Frame(
             prompt=entry["prompt"],
-            base=read_picture(folder / entry["image"]),
-            wrist=read_picture(folder / entry["wrist_image"]),
+            base=read_image(folder / entry["image"]),
+            wrist=read_image(folder / entry["wrist_image"]),
             state=np.array(entry["state"], np.float64),
             step=entry.get("step"),
             expert=np.array(entry["expert"], np.float64) if "expert" in entry else None,
@@ -65,7 +65,7 @@ def with_libero_stats(checkpoint: Checkpoint) -> Checkpoint:
 def observations(policy: UnifiedPolicy, frames: Sequence[Frame]) -> list[dict[str, object]]:
     """The frames in the keys of the policy's robot.
 
-    For another robot than LIBERO's they are its example observations, with these pictures in place of its cameras'.
+    For another robot than LIBERO's they are its example observations, with these images in place of its cameras'.
     """
     if policy.metadata["robot"] == "libero":
         return [
@@ -77,25 +77,25 @@ def observations(policy: UnifiedPolicy, frames: Sequence[Frame]) -> list[dict[st
             }
             for frame in frames
         ]
-    return [_with_pictures(policy.example_observation(seed), frame) for seed, frame in enumerate(frames)]
+    return [_with_images(policy.example_observation(seed), frame) for seed, frame in enumerate(frames)]
 
 
-def _with_pictures(observation: Mapping[str, object], frame: Frame) -> dict[str, object]:
-    """`observation` with each of its pictures replaced: the first by the base camera's, the others by the wrist's."""
-    pictures = iter([frame.base])
+def _with_images(observation: Mapping[str, object], frame: Frame) -> dict[str, object]:
+    """`observation` with each of its images replaced: the first by the base camera's, the others by the wrist's."""
+    camera_images = iter([frame.base])
 
     def replaced(key: str, value: object) -> object:
         if isinstance(value, Mapping):
             return {inner: replaced(inner, item) for inner, item in value.items()}
         if isinstance(value, np.ndarray) and value.ndim == 3:
-            return _like(next(pictures, frame.wrist), value)
+            return _like(next(camera_images, frame.wrist), value)
         return frame.prompt if key in ("prompt", "task") else value
 
     return {key: replaced(key, value) for key, value in observation.items()}
 
 
-def _like(picture: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """`picture` in the layout and range of `other`: HWC or CHW, uint8 or float in [0, 1]."""
+def _like(camera_image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """`image` in the layout and range of `other`: HWC or CHW, uint8 or float in [0, 1]."""
     if np.issubdtype(other.dtype, np.floating):
-        picture = (picture / 255).astype(other.dtype)
-    return np.ascontiguousarray(picture.transpose(2, 0, 1)) if other.shape[0] == 3 else picture
+        camera_image = (camera_image / 255).astype(other.dtype)
+    return np.ascontiguousarray(camera_image.transpose(2, 0, 1)) if other.shape[0] == 3 else camera_image

@@ -1,1 +1,1 @@
-"""Before and after the model: pictures resized, states and actions normalised, prompts tokenised (pipeline.py)."""
+"""Before and after the model: images resized, states and actions normalised, prompts tokenised (pipeline.py)."""

@@ -1,12 +1,12 @@
-"""Pictures resized to what the vision tower reads.
+"""Images resized to what the vision tower reads.
 
-Two ways, because a model must see pictures resized as they were in its training:
+Two ways, because a model must see images resized as they were in its training:
 
 - openpi's: everything becomes uint8; Pillow's bilinear filter (which averages when it shrinks) on uint8; black padding.
 - LeRobot's: float32 in [0, 1]; bilinear without averaging; black padding; then [-1, 1]. LeRobot 0.4 padded with -1
   before that, so with -3 after it.
 
-Both keep the aspect ratio and centre the picture. Sources: openpi's `image_tools.py` and policies; LeRobot's
+Both keep the aspect ratio and centre the image. Sources: openpi's `image_tools.py` and policies; LeRobot's
 `vla_utils.resize_with_pad_torch` and `PI05Policy._preprocess_images` (0.6.1).
 """
 
@@ -26,11 +26,11 @@ from turbopi.support.errors import ObservationError
 
 @dataclass(frozen=True)
 class _Way:
-    """float_images: the model gets float32 in [-1, 1], else uint8. padding: around a picture, as the model gets it."""
+    """float_images: the model gets float32 in [-1, 1], else uint8. padding: around an image, as the model gets it."""
 
     float_images: bool
     padding: int
-    low: float  # where a resized picture in [0, 1] is clamped from below
+    low: float  # where a resized image in [0, 1] is clamped from below
 
 
 RESIZES: dict[ImageResize, _Way] = {
@@ -40,42 +40,42 @@ RESIZES: dict[ImageResize, _Way] = {
 }
 
 
-def fitted(picture: np.ndarray, size: int, resize: ImageResize) -> np.ndarray:
-    """Picture (uint8|float32)[h, w, 3] as the model gets it, [size, size, 3]; the same array if it is that already.
+def fitted(camera_image: np.ndarray, size: int, resize: ImageResize) -> np.ndarray:
+    """Image (uint8|float32)[h, w, 3] as the model gets it, [size, size, 3]; the same array if it is that already.
 
-    float32 is in [0, 1], and LeRobot's ways alone take it. Raises ObservationError if the picture is too narrow.
+    float32 is in [0, 1], and LeRobot's ways alone take it. Raises ObservationError if the image is too narrow.
     """
     way = RESIZES[resize]
-    if not way.float_images and picture.shape == (size, size, 3) and picture.flags.c_contiguous:
-        return picture
+    if not way.float_images and camera_image.shape == (size, size, 3) and camera_image.flags.c_contiguous:
+        return camera_image
     out: np.ndarray = np.empty((size, size, 3), np.float32 if way.float_images else np.uint8)
-    if picture.shape != out.shape:
-        out.fill(way.padding)  # which stays where the picture doesn't reach
+    if camera_image.shape != out.shape:
+        out.fill(way.padding)  # which stays where the image doesn't reach
     if way.float_images:
-        resize_unit_into(picture, out, low=way.low)
+        resize_unit_into(camera_image, out, low=way.low)
     else:
-        resize_into(picture, out)
+        resize_into(camera_image, out)
     return out
 
 
-LARGE = 1 << 18  # bytes of a picture; of smaller ones handing work to threads costs as much as it saves
+LARGE = 1 << 18  # bytes of an image; of smaller ones handing work to threads costs as much as it saves
 
 
-def all_fitted(pictures: Sequence[np.ndarray], size: int, resize: ImageResize) -> list[np.ndarray]:
-    """`fitted` of each, the same bytes. In openpi's way large pictures are resized in threads of our own; LeRobot's way
+def all_fitted(camera_images: Sequence[np.ndarray], size: int, resize: ImageResize) -> list[np.ndarray]:
+    """`fitted` of each, the same bytes. In openpi's way large images are resized in threads of our own; LeRobot's way
     has PyTorch's.
     """
-    large = max((one.size for one in pictures), default=0) > LARGE
-    if _cores() == 1 or len(pictures) == 1 or RESIZES[resize].float_images or not large:
-        return [fitted(one, size, resize) for one in pictures]
-    for one in pictures:
+    large = max((one.size for one in camera_images), default=0) > LARGE
+    if _cores() == 1 or len(camera_images) == 1 or RESIZES[resize].float_images or not large:
+        return [fitted(one, size, resize) for one in camera_images]
+    for one in camera_images:
         placement(one.shape, (size, size, 3))  # refuses before anything starts
-    return list(_threads().map(lambda one: fitted(one, size, resize), pictures))
+    return list(_threads().map(lambda one: fitted(one, size, resize), camera_images))
 
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_cores(), "turbopi-pictures")
+    return ThreadPoolExecutor(_cores(), "turbopi-images")
 
 
 if hasattr(os, "register_at_fork"):
@@ -88,10 +88,10 @@ def _cores() -> int:
 
 
 def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """uint8[h, w, 3] by Pillow, across and then down, as openpi's did: since 13.0 it takes tall pictures down first."""
+    """uint8[h, w, 3] by Pillow, across and then down, as openpi's did: since 13.0 it takes tall images down first."""
     if not image.flags.c_contiguous:
         packed = np.empty(image.shape, np.uint8)
-        copy_picture(image, packed)
+        copy_image(image, packed)
         image = packed
     made = Image.fromarray(image)
     for size in ((width, made.height), (width, height)):
@@ -103,7 +103,7 @@ def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
 def resize_with_pad(images: np.ndarray, height: int, width: int) -> np.ndarray:
     """uint8[*b, h, w, 3] to uint8[*b, height, width, 3], as openpi: aspect ratio kept, centred, padded with 0.
 
-    Pictures that have the size already are returned as they are.
+    Images that have the size already are returned as they are.
     """
     if images.shape[-3:-1] == (height, width):
         return images
@@ -117,14 +117,14 @@ def resize_with_pad(images: np.ndarray, height: int, width: int) -> np.ndarray:
 def resize_into(image: np.ndarray, out: np.ndarray) -> None:
     """`resize_with_pad` of one uint8[h, w, 3] into `out` uint8[height, width, 3], which holds the padding's zeros."""
     if image.shape == out.shape:
-        copy_picture(image, out)
+        copy_image(image, out)
         return
     rows, columns = placement(image.shape, out.shape)
     out[rows, columns] = _resized(image, columns.stop - columns.start, rows.stop - rows.start)
 
 
-def copy_picture(image: np.ndarray, out: np.ndarray) -> None:
-    """Copy a picture: by channel, which is four times faster than all at once where it is a transposed CHW one."""
+def copy_image(image: np.ndarray, out: np.ndarray) -> None:
+    """Copy an image: by channel, which is four times faster than all at once where it is a transposed CHW one."""
     if image.flags.c_contiguous:
         out[:] = image
         return
@@ -133,10 +133,10 @@ def copy_picture(image: np.ndarray, out: np.ndarray) -> None:
 
 
 def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) -> None:
-    """LeRobot's way: one picture in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds the padding.
+    """LeRobot's way: one image in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds the padding.
 
     image   uint8[h, w, 3], divided by 255 first, or float32[h, w, 3] in [0, 1]
-    low     where a resized picture is clamped from below: 0, in LeRobot 0.4 -1
+    low     where a resized image is clamped from below: 0, in LeRobot 0.4 -1
     """
     planes = np.empty((3, *image.shape[:2]), np.float32)  # by channel: torch's layout, and faster than a transpose
     for channel in range(3):
@@ -156,7 +156,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
 
 @lru_cache(maxsize=16)  # the same few in every call
 def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of a `target`-sized frame that a picture of `shape` fills, its aspect ratio kept.
+    """Rows and columns of a `target`-sized frame that an image of `shape` fills, its aspect ratio kept.
 
     Raises ObservationError if nothing of it would be left.
     """
@@ -164,7 +164,7 @@ def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, s
     h, w = int(shape[0] / ratio), int(shape[1] / ratio)
     if h < 1 or w < 1:
         raise ObservationError(
-            f"a picture of {shape[0]}x{shape[1]} pixels is too narrow: resized to {target[0]}x{target[1]} "
+            f"an image of {shape[0]}x{shape[1]} pixels is too narrow: resized to {target[0]}x{target[1]} "
             f"with its aspect ratio kept, nothing of it is left"
         )
     top, left = (target[0] - h) // 2, (target[1] - w) // 2

@@ -39,9 +39,9 @@ _CAMERAS = frozenset(CAMERAS)
 class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
-    resize          False: pictures in uint8 keep their size, for a backend that resizes them
-    pictures        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
-    valid           of each camera, whether there is such a picture
+    resize          False: images in uint8 keep their size, for a backend that resizes them
+    images        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
+    valid           of each camera, whether there is such an image
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
@@ -51,7 +51,7 @@ class Incoming:
     resize: bool = True
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
-    pictures: list[np.ndarray] = field(init=False)
+    camera_images: list[np.ndarray] = field(init=False)
     valid: list[bool] = field(init=False)
 
     state: np.ndarray = field(init=False)
@@ -137,9 +137,9 @@ class Pipeline:
         self.read(one)
         black, dtype = (-1, np.float32) if self._float_images else (0, np.uint8)
         images: np.ndarray = np.empty((len(one.valid), *self._image_shape, 3), dtype)
-        pictures = iter(one.pictures)
+        camera_images = iter(one.camera_images)
         for valid, image in zip(one.valid, images, strict=True):
-            image[:] = next(pictures) if valid else black
+            image[:] = next(camera_images) if valid else black
         return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
 
     def see(self, observation: Mapping[str, object], *, resize: bool = True) -> Incoming:
@@ -286,29 +286,29 @@ class Pipeline:
         sample.state = self.state_scale.normalize(state)
 
     def _resize_images(self, sample: Incoming) -> None:
-        pictures, present = sample.robot.images, sample.robot.image_mask
-        final = sample.robot.in_order or not _CAMERAS.issuperset(pictures)
-        cameras = tuple(pictures) if final else CAMERAS
+        camera_images, present = sample.robot.images, sample.robot.image_mask
+        final = sample.robot.in_order or not _CAMERAS.issuperset(camera_images)
+        cameras = tuple(camera_images) if final else CAMERAS
         sample.valid, checked = [], []
         for camera in cameras:
-            valid = present.get(camera, camera in pictures)
+            valid = present.get(camera, camera in camera_images)
             sample.valid.append(valid)
             if valid:
-                picture = pictures.get(camera)
-                checked.append(picture if is_rgb8(picture) else self._checked_picture(picture, camera))
+                camera_image = camera_images.get(camera)
+                checked.append(camera_image if is_rgb8(camera_image) else self._checked_image(camera_image, camera))
         shape, resize = self._image_shape, self.config.image_resize
         if sample.resize:
-            sample.pictures = all_fitted(checked, shape[0], resize)
+            sample.camera_images = all_fitted(checked, shape[0], resize)
         else:  # the device resizes bytes
-            for picture in checked:
-                placement(picture.shape, shape)  # refuses one that is too narrow before anything starts
+            for camera_image in checked:
+                placement(camera_image.shape, shape)  # refuses one that is too narrow before anything starts
             if self._float_images:
                 checked = [one if one.dtype == np.uint8 else fitted(one, shape[0], resize) for one in checked]
-            sample.pictures = checked
+            sample.camera_images = checked
 
-    def _checked_picture(self, picture: object, camera: str) -> np.ndarray:
-        picture = check_hwc(picture, camera)
-        return picture if self._float_images else to_uint8(picture, camera)
+    def _checked_image(self, camera_image: object, camera: str) -> np.ndarray:
+        camera_image = check_hwc(camera_image, camera)
+        return camera_image if self._float_images else to_uint8(camera_image, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
         state = None

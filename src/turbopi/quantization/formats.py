@@ -50,7 +50,7 @@ INT8 = Format("int8", torch.int8, INT8_MAX, to_int8, holds_nan=False, expert_inp
 FORMATS: Mapping[Numbers, Format] = {"fp8": FP8, "int8": INT8}
 
 
-def told_by(details: object) -> Mapping[str, object] | None:
+def named_by(details: object) -> Mapping[str, object] | None:
     """What a backend's `describe` tells of its calibration (`Quantization.describe`), under the name of the format;
     None: it has none.
     """

@@ -72,7 +72,9 @@ class RealTimeClient:
         self._connect_s, self._answer_s = connect_s, answer_s
         self._lock = threading.Lock()
         self._socket: PolicySocket | None = None
-        self._episode = self._told = 0  # the one now, and the one that a server which keeps the running chunk knows of
+        self._episode = self._reported = (
+            0  # the one now, and the one that a server which keeps the running chunk knows of
+        )
         _keep_freed_memory()
         with self._lock:
             self.metadata = self._connect(connect_s)
@@ -102,9 +104,9 @@ class RealTimeClient:
                 )
             if previous is not None or model_actions or seed is not None:
                 self._check_offered(None if previous is None else previous.mode)
-            sent, told = message(obs, previous, model_actions, seed), self._told
-            if told != self._episode and self._keeps_chunk(sent):
-                sent[f"{PREFIX}reset"], told = True, self._episode
+            sent, reported = message(obs, previous, model_actions, seed), self._reported
+            if reported != self._episode and self._keeps_chunk(sent):
+                sent[f"{PREFIX}reset"], reported = True, self._episode
             packed = _packed(sent)
             assert self._socket is not None
             try:
@@ -120,7 +122,7 @@ class RealTimeClient:
                 ) from error
             if isinstance(reply, str):
                 self._raise(reply)
-            answer, self._told = self._unpacked(reply), told
+            answer, self._reported = self._unpacked(reply), reported
         return checked_answer(_writable(answer), model_actions=model_actions, batch=f"{PREFIX}batch" in obs)
 
     def reset(self) -> None:

@@ -202,8 +202,8 @@ class RealTimeExecutor:
             delay = max(0, min(delay, self._queue.horizon - max(s, step - self._kept_at)))
         if self._offered["execution"] == "rtc_trained" and self._trained_max is not None:
             delay = min(delay, self._trained_max)
-        told = {"reset": self._anew, "step": step, "delay": delay, "execution_horizon": s}
-        return {**observation, **{PREFIX + key: value for key, value in told.items()}}
+        reported = {"reset": self._anew, "step": step, "delay": delay, "execution_horizon": s}
+        return {**observation, **{PREFIX + key: value for key, value in reported.items()}}
 
     # --- the robot ----------------------------------------------------------------------------------------------------
 
@@ -272,7 +272,7 @@ class RealTimeExecutor:
 
     @property
     def wants_observation(self) -> bool:
-        """Whether an observation may be used at the next control step: pictures need be taken only then.
+        """Whether an observation may be used at the next control step: images need be taken only then.
 
         Also true while a chunk is computed, as nobody knows when it comes, and whether it can be used.
         """
@@ -300,9 +300,9 @@ class RealTimeExecutor:
             return list(self._journal.copy().inferred)
 
     def report(self, plot: str | Path | None = None) -> dict[str, Any]:
-        """What happened, as plain values (a JSON document); with `plot`, a picture of it is written there, too.
+        """What happened, as plain values (a JSON document); with `plot`, an image of it is written there, too.
 
-        The picture needs matplotlib. Raises ConfigError for an unknown ending, OutputError if it can't be written.
+        The image needs matplotlib. Raises ConfigError for an unknown ending, OutputError if it can't be written.
         """
         with self._lock:  # the control loop may wait for it: only copies are made here
             queue, journal = self._queue.copy(), self._journal.copy()

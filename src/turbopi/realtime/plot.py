@@ -1,4 +1,4 @@
-"""A picture of a run: what was commanded, where chunks took over, how long the policy took."""
+"""An image of a run: what was commanded, where chunks took over, how long the policy took."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +19,7 @@ _BORDER, _DELAY, _DROPPED, _EMPTY = "0.45", "#4c78a8", "#d62728", "#f2b701"
 
 
 def plot_run(file: Path, journal: Journal, report: dict[str, Any]) -> None:
-    """Write a picture: a row for each dimension of the action, and one for the policy's delays. Raises as
+    """Write an image: a row for each dimension of the action, and one for the policy's delays. Raises as
     `write_figure` does.
     """
     commands = list(journal.commands)[-SHOWN:]

@@ -10,10 +10,10 @@ from turbopi.support.errors import ConfigError
 
 def metadata_of(policy: Any) -> Mapping[str, Any]:
     """What a policy tells of itself; empty if it tells nothing."""
-    told = getattr(policy, "metadata", None)
-    if told is None and hasattr(policy, "get_server_metadata"):  # openpi's client
-        told = policy.get_server_metadata()
-    return told if isinstance(told, Mapping) else {}
+    reported = getattr(policy, "metadata", None)
+    if reported is None and hasattr(policy, "get_server_metadata"):  # openpi's client
+        reported = policy.get_server_metadata()
+    return reported if isinstance(reported, Mapping) else {}
 
 
 def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:

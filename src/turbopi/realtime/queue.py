@@ -86,7 +86,7 @@ class Seam:
     chunk: int
     delay: int  # control steps from the observation to the chunk
     carried_out: int  # actions among them: the row at which the chunk is entered
-    told: int | None  # the delay that the policy was told, if it was told of a running chunk
+    reported: int | None  # the delay that the policy was told, if it was told of a running chunk
     jump: np.ndarray  # float64[d]  its first action − the last command
     gap: np.ndarray | None  # float64[d]  its first action − what the running chunk has for that step, if it has it
 
@@ -163,7 +163,7 @@ class ChunkQueue:
         self._row = self._entered = 0  # of the running chunk: the next one, and the first that was carried out
         self._flight: _Flight | None = None
         self._last: np.ndarray | None = None  # the last action
-        self._check_told_delay()
+        self._check_given_delay()
 
     # --- what is going on ---------------------------------------------------------------------------------------------
 
@@ -248,11 +248,11 @@ class ChunkQueue:
         if self.way.mode is None or self._running is None:
             return None
         row, expected = self._row - ago, max(self._delay.steps, ago)
-        previous = self._told(self._running, row, expected)
+        previous = self._reported(self._running, row, expected)
         self.cut_delays += previous is not None and previous.delay < expected
         return previous
 
-    def _told(self, chunk: Chunk, row: int, expected: int) -> RunningChunk | None:
+    def _reported(self, chunk: Chunk, row: int, expected: int) -> RunningChunk | None:
         """What the policy is told of a chunk whose next action is `row`; the delay is cut to what fits."""
         if self.way.mode is None or row >= len(chunk.actions):
             return None
@@ -262,8 +262,8 @@ class ChunkQueue:
         if self.way.holds and self._trained_max is not None:
             most = min(most, self._trained_max)
         left_over = chunk.model_actions[row:].copy()
-        s_told = None if self._policys_guidance else s
-        return RunningChunk(left_over, min(expected, most), s_told, self.way.mode, chunk.anchor, **self._guidance)
+        s_given = None if self._policys_guidance else s
+        return RunningChunk(left_over, min(expected, most), s_given, self.way.mode, chunk.anchor, **self._guidance)
 
     def arrive(self, result: Any) -> Reason | None:
         """The chunk in flight is there: what `policy.infer` returned. None if it takes over, else why it is dropped.
@@ -285,10 +285,10 @@ class ChunkQueue:
         if entry >= horizon:
             return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
         previous = flight.request.previous
-        told = None if previous is None else previous.delay
-        if told is not None and entry > told:
+        reported = None if previous is None else previous.delay
+        if reported is not None and entry > reported:
             if self.way.holds:
-                text = f"{entry} actions were carried out since its observation; the policy was told {told}"
+                text = f"{entry} actions were carried out since its observation; the policy was told {reported}"
                 return self._drop("late", text)
             self.late += 1
         next_of_running = self._next_of_running()
@@ -300,7 +300,7 @@ class ChunkQueue:
         first = chunk.actions[entry]
         if self._last is not None:
             gap = None if next_of_running is None else first - next_of_running
-            self.seams.append(Seam(self.steps, chunk.number, delay, entry, told, first - self._last, gap))
+            self.seams.append(Seam(self.steps, chunk.number, delay, entry, reported, first - self._last, gap))
         self._running, self._row, self._entered = chunk, entry, entry
         self.chunks += 1
         return None
@@ -319,7 +319,7 @@ class ChunkQueue:
         except ActionError as error:
             raise ConfigError(str(error)) from error
         self._learn(chunk)
-        return self._told(chunk, self.execution_horizon, self._delay.steps)
+        return self._reported(chunk, self.execution_horizon, self._delay.steps)
 
     def fail(self, reason: Reason = "failed", text: str = "the policy gave no chunk") -> None:
         """The chunk in flight will never be there."""
@@ -402,7 +402,7 @@ class ChunkQueue:
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _check_told_delay(self) -> None:
+    def _check_given_delay(self) -> None:
         d = self._delay.steps
         if self.way.holds and self._fixed and self._trained_max is not None and d > self._trained_max:
             raise ConfigError(

@@ -30,15 +30,15 @@ def warm_policy(
     warmup = getattr(policy, "warmup", None)
     if callable(warmup):
         warmup(**({"real_time": way.mode} if way.mode is not None else {}))
-    asked: dict[str, Any] = {"previous": None, "model_actions": True} if way.mode is not None else {}
-    previous = learn(policy.infer(observation, **arguments, **asked))
+    requested: dict[str, Any] = {"previous": None, "model_actions": True} if way.mode is not None else {}
+    previous = learn(policy.infer(observation, **arguments, **requested))
     if previous is not None:
-        asked["previous"] = previous
-        policy.infer(observation, **arguments, **asked)
+        requested["previous"] = previous
+        policy.infer(observation, **arguments, **requested)
     seconds = 0.0
     for _ in range(TIMED_CALLS):
         before = clock()
-        policy.infer(observation, **arguments, **asked)
+        policy.infer(observation, **arguments, **requested)
         seconds = max(seconds, clock() - before)
     return seconds
 

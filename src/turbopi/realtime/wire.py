@@ -9,7 +9,7 @@ object and complex don't. Nothing is ever pickled.
 A message is not trusted: its headers are walked before msgpack builds anything (msgpack allocates what an array
 header claims, so a few bytes could ask for gigabytes), and an array must bring exactly the bytes its shape needs.
 Decoding therefore allocates a small multiple of the message's length, whatever the message says, and what it costs
-besides copying bytes is bounded too: a few milliseconds for the worst message. Pictures aren't copied.
+besides copying bytes is bounded too: a few milliseconds for the worst message. Images aren't copied.
 """
 
 import math
@@ -72,7 +72,7 @@ def _pack_numpy(value: object) -> dict[bytes, object]:
     if not isinstance(value, np.ndarray | np.generic):
         raise WireError(
             f"can't send a {type(value).__module__}.{type(value).__qualname__}: "
-            "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays. Send a tensor or a picture "
+            "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays. Send a tensor or an image "
             "as a numpy array"
         )
     if value.dtype.kind in _REFUSED_KINDS:

@@ -1,8 +1,8 @@
-"""An observation written by hand: a folder with an `observation.json` and the pictures that it names.
+"""An observation written by hand: a folder with an `observation.json` and the images that it names.
 
 A JSON object like the observation, in which
 
-    {"file": "wrist.png"}                    is that picture of the folder, RGB uint8 [h, w, 3]
+    {"file": "wrist.png"}                    is that image of the folder, RGB uint8 [h, w, 3]
     {"file": "wrist.png", "layout": "chw"}   the same as [3, h, w]
     {"file": "wrist.npy"}                    is the array of that file
     [0, 0.5, [1, 2]]                         a list of numbers, is a float64 array
@@ -18,7 +18,7 @@ import numpy as np
 
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading import file_inside, is_finite, read_json, read_npy, shown
-from turbopi.support.reading.images import read_picture
+from turbopi.support.reading.images import read_image
 
 FILE = "observation.json"
 _MAX_BYTES = 64 * 2**20  # numbers may be written out
@@ -66,5 +66,5 @@ def _load_file(value: dict[str, object], name: str, folder: Path) -> np.ndarray:
         raise ObservationError(f"{name!r} names the file {shown(named)}, which isn't in {folder}")
     if is_array:
         return read_npy(file)
-    pixels = read_picture(file)
+    pixels = read_image(file)
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)) if layout == "chw" else pixels

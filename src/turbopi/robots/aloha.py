@@ -81,12 +81,12 @@ class Aloha(Robot):
                 f"unexpected cameras in images: {listed(sorted(unexpected))}; expected "
                 f"{', '.join((*CAMERA_OF, IGNORED))}"
             )
-        pictures = {}
+        camera_images = {}
         for name, camera in CAMERA_OF.items():
             if name in sent or name == "cam_high":
                 key = f"images/{name}"
-                pictures[camera] = parse_chw_image(require(observation, key, KEYS), key)
-        images, mask = with_missing_cameras(pictures, like="base_0_rgb")
+                camera_images[camera] = parse_chw_image(require(observation, key, KEYS), key)
+        images, mask = with_missing_cameras(camera_images, like="base_0_rgb")
         state = read_state(require(observation, "state", KEYS), "state", self.state_dim)
         return RobotInputs(images, mask, self._to_pi(state), optional_prompt(observation))
 
@@ -106,8 +106,8 @@ class Aloha(Robot):
         return actions
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {camera: np.ascontiguousarray(random_image(rng).transpose(2, 0, 1)) for camera in CAMERA_OF}
-        return {"state": rng.random(self.state_dim), "images": pictures, "prompt": "transfer cube"}
+        camera_images = {camera: np.ascontiguousarray(random_image(rng).transpose(2, 0, 1)) for camera in CAMERA_OF}
+        return {"state": rng.random(self.state_dim), "images": camera_images, "prompt": "transfer cube"}
 
 
 def gripper_to_angle(position: np.ndarray) -> np.ndarray:

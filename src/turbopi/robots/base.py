@@ -146,7 +146,7 @@ def names_in(observation: Mapping[str, object], folder: str) -> list[str]:
     """The names directly below `folder`, nested or flat: ["cam_high"] for either form of "images/cam_high"."""
     nested = observation.get(folder, {})
     if not isinstance(nested, Mapping):
-        raise ObservationError(f"{folder!r} is a {type(nested).__name__}, expected a dict of pictures by camera")
+        raise ObservationError(f"{folder!r} is a {type(nested).__name__}, expected a dict of images by camera")
     prefix = folder + "/"
     flat = [str(key)[len(prefix) :] for key in observation if str(key).startswith(prefix)]
     return [*map(str, nested), *flat]
@@ -224,7 +224,7 @@ def with_missing_cameras(images: dict[str, np.ndarray], like: str) -> tuple[dict
 
 
 def black_like(image: np.ndarray) -> np.ndarray:
-    """A read-only black picture of the shape and dtype of `image`, without its memory."""
+    """A read-only black image of the shape and dtype of `image`, without its memory."""
     return _black(image.shape, image.dtype)
 
 

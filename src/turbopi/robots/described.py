@@ -32,7 +32,7 @@ OPTIONAL = ("delta_action_dims", "prompt_key", "default_prompt", "reset_pose", "
 class Described(Robot):
     """A robot as a file describes it.
 
-    cameras   observation key -> the model's camera; pictures (uint8|float)[h, w, 3] or [3, h, w], all required
+    cameras   observation key -> the model's camera; images (uint8|float)[h, w, 3] or [3, h, w], all required
     state     observation key -> its width, concatenated in this order; a scalar counts as width 1
     action_dim, delta_mask, prompt_key, default_prompt, reset_pose, action_keys   see `Robot` and docs/robots.md
     """
@@ -60,10 +60,10 @@ class Described(Robot):
         return (*self.cameras, *self.state, self.prompt_key)
 
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
-        pictures = {
+        camera_images = {
             camera: parse_image(require(observation, key, self._keys), key) for key, camera in self.cameras.items()
         }
-        images, mask = with_missing_cameras(pictures, like=next(iter(pictures)))
+        images, mask = with_missing_cameras(camera_images, like=next(iter(camera_images)))
         parts = [read_state(require(observation, key, self._keys), key, width) for key, width in self.state.items()]
         return RobotInputs(images, mask, np.concatenate(parts), optional_prompt(observation, self.prompt_key))
 
@@ -71,9 +71,9 @@ class Described(Robot):
         return actions[:, : self.action_dim]
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {key: random_image(rng) for key in self.cameras}
+        camera_images = {key: random_image(rng) for key in self.cameras}
         state = {key: rng.uniform(-1, 1, width) for key, width in self.state.items()}
-        return {**pictures, **state, self.prompt_key: self.default_prompt or "pick up the red block"}
+        return {**camera_images, **state, self.prompt_key: self.default_prompt or "pick up the red block"}
 
 
 def load_robot(path: str | Path) -> Described:

@@ -1,4 +1,4 @@
-"""Pictures as robots send them, checked: what their observations' readers use."""
+"""Images as robots send them, checked: what their observations' readers use."""
 
 from typing import TypeGuard
 
@@ -10,12 +10,12 @@ _UINT8 = np.dtype(np.uint8)
 
 
 def is_rgb8(value: object) -> TypeGuard[np.ndarray]:
-    """Whether it is a picture uint8[h, w, 3], which needs no other check and no conversion."""
+    """Whether it is an image uint8[h, w, 3], which needs no other check and no conversion."""
     return type(value) is np.ndarray and value.dtype == _UINT8 and value.shape[2:] == (3,) and value.size > 0
 
 
 def parse_image(value: object, name: str) -> np.ndarray:
-    """One picture as openpi's LIBERO and DROID robots take it: uint8[h, w, 3].
+    """One image as openpi's LIBERO and DROID robots take it: uint8[h, w, 3].
 
     `value` is uint8 in [0, 255] or float in [0, 1], HWC or CHW; it counts as CHW when its first axis is 3.
     Raises ObservationError, naming `name`, for anything else.
@@ -29,18 +29,18 @@ def parse_image(value: object, name: str) -> np.ndarray:
 
 
 def parse_chw_image(value: object, name: str) -> np.ndarray:
-    """One picture that must be CHW, as openpi's ALOHA clients send it: uint8[h, w, 3]."""
+    """One image that must be CHW, as openpi's ALOHA clients send it: uint8[h, w, 3]."""
     image = check_image(value, name)
     if image.shape[0] != 3:
         raise ObservationError(
-            f"{name} has shape {image.shape}, but this robot's pictures are CHW: (3, height, width). "
-            f"Send numpy.transpose(image, (2, 0, 1)) of an HWC picture"
+            f"{name} has shape {image.shape}, but this robot's images are CHW: (3, height, width). "
+            f"Send numpy.transpose(image, (2, 0, 1)) of an HWC image"
         )
     return to_uint8(image.transpose(1, 2, 0), name)
 
 
 def parse_unit_image(value: object, name: str) -> np.ndarray:
-    """One picture as LeRobot takes it: (uint8|float32)[h, w, 3], float32 in [0, 1]; CHW or HWC as `parse_image`."""
+    """One image as LeRobot takes it: (uint8|float32)[h, w, 3], float32 in [0, 1]; CHW or HWC as `parse_image`."""
     image = check_image(value, name)
     if image.shape[0] == 3:
         image = image.transpose(1, 2, 0)
@@ -56,12 +56,12 @@ def check_image(value: object, name: str) -> np.ndarray:
     try:
         image = np.asarray(value)
     except Exception as error:
-        raise ObservationError(f"{name} isn't a picture: {error}") from error
+        raise ObservationError(f"{name} isn't an image: {error}") from error
     if image.dtype != _UINT8 and image.dtype.kind != "f":
         raise ObservationError(f"{name} has dtype {image.dtype}; send uint8 in [0, 255] or float in [0, 1]")
     if image.ndim != 3:
         raise ObservationError(
-            f"{name} has shape {image.shape}; send one picture, (height, width, 3) or (3, height, width), "
+            f"{name} has shape {image.shape}; send one image, (height, width, 3) or (3, height, width), "
             f"without a batch axis"
         )
     if image.size == 0:
@@ -81,7 +81,7 @@ def _check_rgb(image: np.ndarray, name: str) -> np.ndarray:
 
 
 def to_uint8(image: np.ndarray, name: str = "image") -> np.ndarray:
-    """Float pictures in [0, 1] to uint8 by truncation of 255 * x, as openpi; uint8 passes."""
+    """Float images in [0, 1] to uint8 by truncation of 255 * x, as openpi; uint8 passes."""
     if image.dtype == _UINT8:
         return image
     _check_unit_range(image, name)
@@ -93,6 +93,6 @@ def _check_unit_range(image: np.ndarray, name: str) -> None:
     low, high = float(image.min()), float(image.max())
     if not (low > -1 / 255 and high < 256 / 255):
         raise ObservationError(
-            f"{name} is a float picture with values from {low:g} to {high:g}; float pictures are in [0, 1]. "
+            f"{name} is a float image with values from {low:g} to {high:g}; float images are in [0, 1]. "
             f"Send uint8 for [0, 255]"
         )

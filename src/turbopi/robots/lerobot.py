@@ -111,7 +111,7 @@ class LeRobot(Robot):
 
     @cached_property
     def _cameras(self) -> tuple[str, ...]:
-        """All keys that pictures are read from."""
+        """All keys that images are read from."""
         return (*self.image_keys, *self._spare)
 
     @cached_property
@@ -165,10 +165,10 @@ class LeRobot(Robot):
         return actions[:, : self.action_dim]
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {self.sent_as(key): rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
+        camera_images = {self.sent_as(key): rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
         state = rng.uniform(-1, 1, self.state_dim).astype(np.float32)
         return {
-            **pictures,
+            **camera_images,
             self.sent_as(STATE): state,
             TASK: "pick up the black bowl and place it on the plate",
         }

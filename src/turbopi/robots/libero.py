@@ -1,6 +1,6 @@
 """LIBERO, the simulation benchmark: a Franka arm with a camera at its base and one at its wrist.
 
-openpi's client turns both pictures by 180 degrees before it sends them; the models were trained on those.
+openpi's client turns both images by 180 degrees before it sends them; the models were trained on those.
 """
 
 from collections.abc import Mapping

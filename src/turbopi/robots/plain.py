@@ -29,7 +29,7 @@ class Plain(Robot):
 
     in      images/{base_0_rgb, left_wrist_0_rgb, right_wrist_0_rgb}   (uint8|float)[h, w, 3] or [3, h, w]; at least
             one, the others are masked; the folder may be called `image`, as inside openpi
-            image_mask/{the same}   bool, may be left out; False: as if there were no such picture
+            image_mask/{the same}   bool, may be left out; False: as if there were no such image
             state   float[s], for Pi0 s up to the model's action_dim
             prompt
     out     [H, action_dim], all of the model's dimensions
@@ -45,16 +45,16 @@ class Plain(Robot):
         if unexpected or not sent:
             got = listed(unexpected) if unexpected else "no camera"
             raise ObservationError(f"{folder} has {got}; expected at least one of {', '.join(CAMERAS)}")
-        pictures = {
+        camera_images = {
             camera: parse_image(find(observation, f"{folder}/{camera}"), f"{folder}/{camera}") for camera in sent
         }
-        pictures = self._unmasked(observation, folder, pictures)
-        images, mask = with_missing_cameras(pictures, like=next(iter(pictures)))
+        camera_images = self._unmasked(observation, folder, camera_images)
+        images, mask = with_missing_cameras(camera_images, like=next(iter(camera_images)))
         state = read_state(require(observation, "state", keys), "state", None)
         return RobotInputs(images, mask, state, optional_prompt(observation))
 
     def _unmasked(
-        self, observation: Mapping[str, object], folder: str, pictures: dict[str, np.ndarray]
+        self, observation: Mapping[str, object], folder: str, camera_images: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """Those that `image_mask` doesn't leave out."""
         masks = {}
@@ -68,18 +68,20 @@ class Plain(Robot):
             if not isinstance(value, bool | np.bool_):
                 raise ObservationError(f"{key} is {str(value)[:60]}; expected true or false")
             masks[camera] = bool(value)
-            if masks[camera] and camera not in pictures:
+            if masks[camera] and camera not in camera_images:
                 raise ObservationError(f"{key} is True, but {folder} has no {camera}")
-        left = {camera: picture for camera, picture in pictures.items() if masks.get(camera, True)}
+        left = {camera: camera_image for camera, camera_image in camera_images.items() if masks.get(camera, True)}
         if not left:
-            raise ObservationError(f"image_mask leaves out all of {', '.join(pictures)}; the model needs one camera")
+            raise ObservationError(
+                f"image_mask leaves out all of {', '.join(camera_images)}; the model needs one camera"
+            )
         return left
 
     def _sent(self, observation: Mapping[str, object]) -> tuple[str, list[str]]:
-        """The folder that the pictures are in, and their names."""
+        """The folder that the images are in, and their names."""
         images, image = names_in(observation, "images"), names_in(observation, "image")
         if images and image:
-            raise ObservationError("the observation has pictures in both `images` and `image`; send one of the two")
+            raise ObservationError("the observation has images in both `images` and `image`; send one of the two")
         return ("image", image) if image else ("images", images)
 
     def outputs(self, actions: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A robot that sends what LeRobot's `robot.get_observation()` returns: a number a joint, and pictures by camera.
+"""A robot that sends what LeRobot's `robot.get_observation()` returns: a number a joint, and images by camera.
 
     {"shoulder_pan.pos": -3.1, …, "gripper.pos": 40.0, "front": uint8[480, 640, 3], "task": "fold the towel"}
 
@@ -138,13 +138,13 @@ class RawKeys(Robot):
             )
         with np.errstate(over="ignore"):  # the pipeline refuses what isn't finite
             named: dict[str, object] = {self.checkpoint.sent_as(STATE): np.concatenate(numbers).astype(np.float32)}
-        named |= self._pictures(observation)
+        named |= self._images(observation)
         if has(observation, self.described.task_key):
             named[TASK] = find(observation, self.described.task_key)
         return self.checkpoint.inputs(named)
 
-    def _pictures(self, observation: Mapping[str, object]) -> dict[str, object]:
-        """The pictures under the checkpoint's keys. Without `cameras` in the description, pictures of other names are
+    def _images(self, observation: Mapping[str, object]) -> dict[str, object]:
+        """The images under the checkpoint's keys. Without `cameras` in the description, images of other names are
         handed on, too: `LeRobot` names them in its warning where a camera is missing.
         """
         if self.described.cameras is not None:
@@ -164,9 +164,9 @@ class RawKeys(Robot):
         return self.checkpoint.outputs(actions)
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {camera: rng.integers(256, size=(480, 640, 3), dtype=np.uint8) for camera in self.cameras}
+        camera_images = {camera: rng.integers(256, size=(480, 640, 3), dtype=np.uint8) for camera in self.cameras}
         numbers = {key: float(rng.uniform(-1, 1)) for key in self.joints}
-        return {**numbers, **pictures, self.described.task_key: "pick up the red block"}
+        return {**numbers, **camera_images, self.described.task_key: "pick up the red block"}
 
 
 def raw_description(robot: object) -> RawDescription | None:

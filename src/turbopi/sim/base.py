@@ -20,7 +20,7 @@ class SimulatorUnavailable(TurboPiError):
     """A simulator can't run on this machine; the message says why and what to do."""
 
 
-MAX_PX = 4096  # of a picture's width and height
+MAX_PX = 4096  # of an image's width and height
 _Count = Annotated[int, Meta(ge=0, le=10**9)]
 
 
@@ -64,19 +64,19 @@ class SimSettings:
 
 
 class Environment(Protocol):
-    """One task. Its pictures are drawn only when they are asked for, as drawing takes most of a simulator's time."""
+    """One task. Its images are drawn only when they are asked for, as drawing takes most of a simulator's time."""
 
     def reset(self, initial_state: int) -> None:
-        """Begin an episode from that initial state and wait until things have come to rest. Draws the pictures."""
+        """Begin an episode from that initial state and wait until things have come to rest. Draws the images."""
 
     def observation(self) -> dict[str, Any]:
-        """What a policy is sent: pictures uint8[px, px, 3], state float64[d], prompt, under the robot's keys.
+        """What a policy is sent: images uint8[px, px, 3], state float64[d], prompt, under the robot's keys.
 
         Only after `reset` or a `step` with look=True.
         """
 
     def step(self, action: np.ndarray, look: bool) -> bool:
-        """One control step; True if the task is solved after it. `look`: the pictures are needed after this step."""
+        """One control step; True if the task is solved after it. `look`: the images are needed after this step."""
 
     def draw(self) -> list[np.ndarray]:
         """What the cameras see now, for a video: uint8[px, px, 3] each. Changes nothing in the simulation."""
@@ -129,20 +129,22 @@ def faults_named(simulator: Simulator, part: str) -> Iterator[None]:
 def observation_problem(observation: Any, image_keys: Sequence[str]) -> str | None:
     """What of an observation no policy can be sent, whichever it is; None if nothing is wrong.
 
-    image_keys   where its pictures are, uint8[h, w, 3]
+    image_keys   where its images are, uint8[h, w, 3]
     """
     if not isinstance(observation, dict):
         return f"the observation is a {type(observation).__name__}; it should be a dict of keys and values"
     for key in image_keys:
         if key not in observation:
             return f"the observation has no {key!r}; it has {', '.join(map(str, observation)) or 'nothing'}"
-        picture = observation[key]
-        fits = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size
-        if not fits or picture.ndim != 3 or picture.shape[2] != 3:
+        camera_image = observation[key]
+        fits = isinstance(camera_image, np.ndarray) and camera_image.dtype == np.uint8 and camera_image.size
+        if not fits or camera_image.ndim != 3 or camera_image.shape[2] != 3:
             found = (
-                f"{picture.dtype}{list(picture.shape)}" if isinstance(picture, np.ndarray) else type(picture).__name__
+                f"{camera_image.dtype}{list(camera_image.shape)}"
+                if isinstance(camera_image, np.ndarray)
+                else type(camera_image).__name__
             )
-            return f"{key!r} is {found}; a picture should be uint8[h, w, 3]"
+            return f"{key!r} is {found}; an image should be uint8[h, w, 3]"
     for key, value in observation.items():
         numbers = np.atleast_1d(value) if isinstance(value, float | np.ndarray | np.floating) else np.zeros(0)
         if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():

@@ -1,13 +1,13 @@
 """A built-in dynamic task: catch a target that runs around a post and turns back without warning. NumPy alone.
 
 It has LIBERO's observations and actions, as the reacher. Unlike there, and unlike in LIBERO, time matters: whoever
-acts on an old picture runs the wrong way, and whoever stands still while thinking is too slow.
+acts on an old image runs the wrong way, and whoever stands still while thinking is too slow.
 
     target   runs on a circle around the post, and turns back at random moments, which nobody can foresee
     tip      action[:2], cut to length 1, moves it by SPEED in that direction; the other numbers do nothing
     post     a tip that touches it is stopped for good: the episode can't be solved any more
     solved   when the tip has been within RADIUS of the target for HOLD steps in a row
-    pictures the whole table, and its part around the tip: the target in red, where it was TRAIL steps ago in green,
+    images the whole table, and its part around the tip: the target in red, where it was TRAIL steps ago in green,
              the tip in blue, the post in grey
     state    position x, y of the tip, then six zeros
 
@@ -106,8 +106,8 @@ class Chase:
         layers = [_blobs(axis, place - centre) for place in shown]
         x, y = axis[None, :] + centre[:, :1], axis[None, :] - centre[:, 1:]  # y grows upwards, rows downwards
         post = x[:, None, :] ** 2 + y[:, :, None] ** 2 < POST**2
-        picture = np.stack(layers, axis=-1) * 215 + 40 * post[..., None]
-        drawn: np.ndarray = np.rint(picture).astype(np.uint8)
+        camera_image = np.stack(layers, axis=-1) * 215 + 40 * post[..., None]
+        drawn: np.ndarray = np.rint(camera_image).astype(np.uint8)
         return drawn
 
 
@@ -171,11 +171,11 @@ class ChaseEnvironment:
         for _ in range(self.settings.wait_steps):
             self.world.step(np.zeros((1, 7)))
         self.world.cleared()
-        self._pictures: list[np.ndarray] = self.draw()
+        self._images: list[np.ndarray] = self.draw()
 
     def observation(self) -> dict[str, Any]:
-        assert self._pictures, "the step before wasn't told to look"
-        base, wrist = self._pictures
+        assert self._images, "the step before wasn't told to look"
+        base, wrist = self._images
         return {
             "observation/image": base,
             "observation/wrist_image": wrist,
@@ -185,11 +185,11 @@ class ChaseEnvironment:
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         solved = bool(self.world.step(np.asarray(action)[None])[0])
-        self._pictures = self.draw() if look else []
+        self._images = self.draw() if look else []
         return solved
 
     def draw(self) -> list[np.ndarray]:
         return list(self.world.draw(self.settings.camera_px)[0])
 
     def close(self) -> None:
-        self._pictures = []
+        self._images = []

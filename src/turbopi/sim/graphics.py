@@ -18,18 +18,19 @@ def choose_renderer(environ: Mapping[str, str] = os.environ) -> str:
 
     Raises SimulatorUnavailable with the install command if none is.
     """
-    asked = environ.get("MUJOCO_GL", "").lower().strip()
-    if asked:
-        if asked not in _RENDERERS:
-            raise SimulatorUnavailable(f"MUJOCO_GL is {asked!r}; LIBERO is drawn off screen with egl or osmesa")
-        if not _has_library(asked):
+    requested = environ.get("MUJOCO_GL", "").lower().strip()
+    if requested:
+        if requested not in _RENDERERS:
+            raise SimulatorUnavailable(f"MUJOCO_GL is {requested!r}; LIBERO is drawn off screen with egl or osmesa")
+        if not _has_library(requested):
             raise SimulatorUnavailable(
-                f"MUJOCO_GL={asked}, but lib{_RENDERERS[asked]} isn't installed; on Debian or Ubuntu: {_install(asked)}"
+                f"MUJOCO_GL={requested}, but lib{_RENDERERS[requested]} isn't installed; on Debian or Ubuntu: "
+                f"{_install(requested)}"
             )
-        return asked
+        return requested
     if sys.platform != "linux":
         raise SimulatorUnavailable(
-            f"LIBERO's pictures are drawn on Linux only, with EGL or OSMesa; this is {sys.platform}"
+            f"LIBERO's images are drawn on Linux only, with EGL or OSMesa; this is {sys.platform}"
         )
     preferred = ("egl", "osmesa") if any(Path(device).exists() for device in _GPU_DEVICES) else ("osmesa", "egl")
     for name in preferred:

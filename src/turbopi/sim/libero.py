@@ -1,11 +1,11 @@
 """LIBERO, drawn only when the policy looks, with results equal to the stock environment's.
 
 robosuite samples all sensors at one physics substep inside each control step, and which one it is depends on how often
-observations were forced before. A picture drawn after the step would therefore be newer than the state beside it, and
-than the picture of the stock environment. So ours are drawn by a sensor of our own, registered beside robosuite's: it
+observations were forced before. An image drawn after the step would therefore be newer than the state beside it, and
+than the image of the stock environment. So ours are drawn by a sensor of our own, registered beside robosuite's: it
 is called at the very same substep, draws when the policy will look, and costs nothing otherwise.
 
-The pictures are turned by 180 degrees as openpi's client does: upright, but mirrored left to right, as in training.
+The images are turned by 180 degrees as openpi's client does: upright, but mirrored left to right, as in training.
 """
 
 import contextlib
@@ -96,7 +96,7 @@ class LiberoEnvironment:
         self.instruction: str = benchmark.get_task(task).language
         self.initial_states: np.ndarray = benchmark.get_task_init_states(task)
         self._look = True
-        self._pictures: dict[str, np.ndarray] = {}
+        self._images: dict[str, np.ndarray] = {}
         self._obs: dict[str, Any] = {}
         self._next_in_task = -1  # with task seeding: the initial state that the next reset is for; -1: not seeded
         self._control = _make_environment(benchmark.get_task_bddl_file_path(task))
@@ -116,12 +116,12 @@ class LiberoEnvironment:
             self.step(WAIT_ACTION, look=step == self.settings.wait_steps - 1)
 
     def observation(self) -> dict[str, Any]:
-        assert self._pictures, "the step before wasn't told to look"
-        return {**self._pictures, "observation/state": openpi_state(self._obs), "prompt": self.instruction}
+        assert self._images, "the step before wasn't told to look"
+        return {**self._images, "observation/state": openpi_state(self._obs), "prompt": self.instruction}
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         self._look = look
-        self._pictures = {}
+        self._images = {}
         self._obs, _, success, _ = self.domain.step(action)
         return bool(success)
 
@@ -155,7 +155,7 @@ class LiberoEnvironment:
 
         def look(_: Any) -> np.ndarray:
             if self._look:
-                self._pictures = {key: self._camera(camera) for key, camera in CAMERAS.items()}
+                self._images = {key: self._camera(camera) for key, camera in CAMERAS.items()}
             return np.zeros(1)
 
         self._look = False  # robosuite tries the sensor
@@ -165,8 +165,8 @@ class LiberoEnvironment:
 
     def _camera(self, name: str) -> np.ndarray:
         px = self.settings.camera_px
-        picture = self.domain.sim.render(camera_name=name, width=px, height=px)  # bottom-up
-        return np.ascontiguousarray(picture[::-1, ::-1])
+        camera_image = self.domain.sim.render(camera_name=name, width=px, height=px)  # bottom-up
+        return np.ascontiguousarray(camera_image[::-1, ::-1])
 
 
 def openpi_state(obs: dict[str, Any]) -> np.ndarray:

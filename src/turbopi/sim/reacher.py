@@ -63,7 +63,7 @@ class ReacherEnvironment:
     def __init__(self, color: str, task: int, settings: SimSettings) -> None:
         self.color, self.task, self.settings = color, task, settings
         self.position, self.goal = np.zeros(2), np.zeros(2)
-        self._pictures: list[np.ndarray] = []
+        self._images: list[np.ndarray] = []
 
     def reset(self, initial_state: int) -> None:
         if self.settings.seeding == "episode":
@@ -76,8 +76,8 @@ class ReacherEnvironment:
             self.step(np.zeros(7), look=step == self.settings.wait_steps)
 
     def observation(self) -> dict[str, Any]:
-        assert self._pictures, "the step before wasn't told to look"
-        base, wrist = self._pictures
+        assert self._images, "the step before wasn't told to look"
+        base, wrist = self._images
         return {
             "observation/image": base,
             "observation/wrist_image": wrist,
@@ -87,7 +87,7 @@ class ReacherEnvironment:
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         self.position = np.clip(self.position + SPEED * np.clip(action[:2], -1, 1), -1, 1)
-        self._pictures = self.draw() if look else []
+        self._images = self.draw() if look else []
         return bool(np.linalg.norm(self.position - self.goal) < RADIUS)
 
     def draw(self) -> list[np.ndarray]:
@@ -95,14 +95,14 @@ class ReacherEnvironment:
         return [self._view(np.zeros(2), 1.1), self._view(self.position, 0.3)]
 
     def close(self) -> None:
-        self._pictures = []
+        self._images = []
 
     def _view(self, centre: np.ndarray, half_width: float) -> np.ndarray:
         px = self.settings.camera_px
-        picture = np.full((px, px, 3), 235, np.uint8)
+        camera_image = np.full((px, px, 3), 235, np.uint8)
         axis = (np.arange(px) + 0.5) / px * 2 - 1
         for place, radius, color in ((self.goal, RADIUS, _RGB[self.color]), (self.position, RADIUS / 2, (20, 20, 20))):
             x, y = (place - centre) / half_width
             inside = (axis[None, :] - x) ** 2 + (axis[:, None] + y) ** 2 < (radius / half_width) ** 2
-            picture[inside] = color
-        return picture
+            camera_image[inside] = color
+        return camera_image

@@ -1,4 +1,4 @@
-"""What people are shown of an observation and its action chunk: its pictures, and the actions by groups of one unit."""
+"""What people are shown of an observation and its action chunk: its images, and the actions by groups of one unit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,15 +58,15 @@ def action_groups(robot: str, dims: int) -> list[ActionGroup]:
     ]
 
 
-def pictures_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.ndarray]:
-    """The pictures in an observation of any robot, by key, as [h, w, 3] to look at."""
+def images_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.ndarray]:
+    """The images in an observation of any robot, by key, as [h, w, 3] to look at."""
     found: dict[str, np.ndarray] = {}
     for key, value in observation.items():
         name = f"{below}/{key}" if below else str(key)
         if isinstance(value, Mapping):
-            found |= pictures_of(value, name)
+            found |= images_of(value, name)
         elif isinstance(value, np.ndarray) and value.ndim == 3 and value.dtype.kind in "fiu":
-            picture = value.transpose(1, 2, 0) if value.shape[0] == 3 else value
-            if picture.shape[-1] == 3:
-                found[name] = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 1)
+            camera_image = value.transpose(1, 2, 0) if value.shape[0] == 3 else value
+            if camera_image.shape[-1] == 3:
+                found[name] = camera_image if camera_image.dtype == np.uint8 else np.clip(camera_image, 0, 1)
     return found

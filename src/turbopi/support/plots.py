@@ -1,4 +1,4 @@
-"""Pictures of action chunks, as PNG files, and the colours of all plots: one colour for one thing."""
+"""Images of action chunks, as PNG files, and the colours of all plots: one colour for one thing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,30 +26,30 @@ class Row:
     """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines."""
 
     heading: str
-    pictures: dict[str, np.ndarray]  # camera -> [h, w, 3]
+    camera_images: dict[str, np.ndarray]  # camera -> [h, w, 3]
     actions: np.ndarray
     oracle: np.ndarray | None = None
     expert: np.ndarray | None = None
 
 
 def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
-    """Write a PNG with one row an observation: its pictures, then its action chunk by groups of one unit.
+    """Write a PNG with one row an observation: its images, then its action chunk by groups of one unit.
 
     A group's axis is the same in every row. Raises as `write_figure` does.
     """
     groups = action_groups(robot, rows[0].actions.shape[1])
-    num_pictures = max(len(row.pictures) for row in rows)
+    num_images = max(len(row.camera_images) for row in rows)
     limits = [_limits(group, rows) for group in groups]
-    widths = [1.0] * num_pictures + [1.45] * len(groups)
+    widths = [1.0] * num_images + [1.45] * len(groups)
     figure = Figure(figsize=(0.8 + 2.45 * sum(widths), 0.9 + 2.75 * len(rows)), dpi=_DPI, layout="constrained")
     if random_weights:
         title += "\nrandom weights: the actions mean nothing"
     figure.suptitle(as_text(title), fontsize=14, fontweight="bold", color=BOUND if random_weights else "black")
     for row, panel in zip(rows, np.atleast_1d(np.array(figure.subfigures(len(rows), 1))), strict=True):
         panel.suptitle(as_text(row.heading), fontsize=10.5, x=0.01, ha="left")
-        axes = np.atleast_1d(panel.subplots(1, num_pictures + len(groups), width_ratios=widths))
-        _draw_pictures(axes[:num_pictures], row.pictures)
-        for ax, group, span in zip(axes[num_pictures:], groups, limits, strict=True):
+        axes = np.atleast_1d(panel.subplots(1, num_images + len(groups), width_ratios=widths))
+        _draw_images(axes[:num_images], row.camera_images)
+        for ax, group, span in zip(axes[num_images:], groups, limits, strict=True):
             _draw_group(ax, group, row)
             ax.set_ylim(span)
     write_figure(file, figure)
@@ -89,11 +89,11 @@ def _limits(group: ActionGroup, rows: Sequence[Row]) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-def _draw_pictures(axes: Any, pictures: dict[str, np.ndarray]) -> None:
+def _draw_images(axes: Any, camera_images: dict[str, np.ndarray]) -> None:
     for ax in axes:
         ax.set_axis_off()
-    for ax, (camera, picture) in zip(axes, pictures.items(), strict=False):
-        ax.imshow(picture)
+    for ax, (camera, camera_image) in zip(axes, camera_images.items(), strict=False):
+        ax.imshow(camera_image)
         ax.set_title(as_text(camera), fontsize=9)
 
 

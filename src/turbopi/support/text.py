@@ -40,14 +40,14 @@ def did_you_mean(typed: str, known: Iterable[str]) -> str:
     return f"did you mean {' or '.join(meant)}?" if meant else ""
 
 
-def names_known(typed: str, told: str, known: Iterable[str]) -> str:
+def names_known(typed: str, reported: str, known: Iterable[str]) -> str:
     """What there is instead of a name that isn't known: "presets are a, b", behind what was probably meant.
 
-    told  begins it: "presets are"
+    reported  begins it: "presets are"
     """
     names = list(known)
     meant = did_you_mean(typed, names)
-    return f"{f'{meant} {told.capitalize()}' if meant else told} {', '.join(names)}"
+    return f"{f'{meant} {reported.capitalize()}' if meant else reported} {', '.join(names)}"
 
 
 def denoising(about: Mapping[str, object]) -> str:

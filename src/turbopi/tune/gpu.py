@@ -20,7 +20,7 @@ INVERSE = 30.0  # 1 / scale of results that leave in E4M3
 ROUND_MICROSECONDS = 300.0  # a round is at least as long, so that the clock's own error doesn't count
 CALLS = 8  # of a graph at least
 MOST_REPLAYS = 50
-SLACK, TWINS = 0.006, 1.25  # an error may be the first and so many times the twin's
+SLACK, REFERENCES = 0.006, 1.25  # an error may be the first and so many times the twin's
 L2_BYTES = 50 << 20  # where PyTorch doesn't tell
 STREAMED = 3  # times the L2 cache: copies of a weight that take turns, so that none is found there, as in a call
 MOST_MEMORY = 0.25  # of what is free, for such copies
@@ -30,7 +30,7 @@ class GpuBench(ABC):
     """A `race.Bench` of an operation on a GPU. A subclass makes inputs and runs the operation."""
 
     exact: Tensor  # float32, what the result is to be
-    twin_error: float  # of the plain operation in the same numbers
+    reference_error: float  # of the plain operation in the same numbers
     copies: int  # of the inputs, which take turns
     margin = MARGIN  # of the usual time that a tile must gain
 
@@ -57,7 +57,7 @@ class GpuBench(ABC):
 
     @property
     def bound(self) -> float:
-        return SLACK + TWINS * self.twin_error
+        return SLACK + REFERENCES * self.reference_error
 
     def prepare(self, candidates: Sequence[Knobs]) -> Mapping[int, str]:
         def compiled(knobs: Knobs) -> str | None:

@@ -88,8 +88,8 @@ class Product(ProductBench):
         if one.normed:
             self._fold_norm(first)
         else:
-            self.exact, twin = self._products(self.x.float() if not self.fp8 else self.x, self.x, first)
-            self.twin_error = relative(self.whole(twin), self.exact)
+            self.exact, reference = self._products(self.x.float() if not self.fp8 else self.x, self.x, first)
+            self.reference_error = relative(self.whole(reference), self.exact)
 
     def _fold_norm(self, first: Matrix) -> None:
         """The norm's weights, the sums of the rows that it is made of, and matrices that take it."""
@@ -101,16 +101,16 @@ class Product(ProductBench):
         if isinstance(first, ScaledMatrix):
             self._copied(first, scale, shift)
             wide = normed @ first.dequantized().T + bias.float()
-            twin = first.product(to_e4m3(normed, first.inverse), bias)
+            reference = first.product(to_e4m3(normed, first.inverse), bias)
         else:
             self.sums = sums_of(self.raw)
             made = Folded.fold(first, bias, scale, shift)
             self.folded: list[Folded] = [replace(made, data=made.data.clone()) for _ in range(self.copies)]
             wide = normed @ first.float().T + bias.float()
-            twin = F.linear(normed.to(torch.bfloat16), first, bias).float()
+            reference = F.linear(normed.to(torch.bfloat16), first, bias).float()
         self.exact = activated(one.operation, wide)
-        twin = plain.as_input(activated(one.operation, twin), torch.bfloat16, self.inverse)
-        self.twin_error = relative(self.whole(twin), self.exact)
+        reference = plain.as_input(activated(one.operation, reference), torch.bfloat16, self.inverse)
+        self.reference_error = relative(self.whole(reference), self.exact)
 
     def _copied(self, first: ScaledMatrix, scale: Tensor, shift: Tensor) -> None:
         """The copy of the stream in the units of another one's rows, as `bf16.Copy` says."""
@@ -136,10 +136,10 @@ class Product(ProductBench):
         if one.operation == "residual":
             assert self.norm_behind is not None
             exact = exact + self.norm_behind.stream.float()
-        return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self.twin(x, weight)
+        return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self.reference(x, weight)
 
-    def twin(self, x: Tensor, weight: Matrix) -> Tensor:
-        result = super().twin(x, weight)
+    def reference(self, x: Tensor, weight: Matrix) -> Tensor:
+        result = super().reference(x, weight)
         norm = self.norm_behind
         return result + norm.stream if self.operation.operation == "residual" and norm is not None else result
 

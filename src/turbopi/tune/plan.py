@@ -30,28 +30,28 @@ class Plan:
     planned: Sequence[Planned]
 
 
-def kernels_to_tune(asked: str, capability: tuple[int, int]) -> list[Kernels]:
+def kernels_to_tune(requested: str, capability: tuple[int, int]) -> list[Kernels]:
     """Whose tiles: "auto" those of the kernels that `fused` takes here. Raises ConfigError."""
-    if asked not in KERNELS:
-        raise ConfigError(f"--kernels is {asked!r}; expected one of {', '.join(KERNELS)}")
+    if requested not in KERNELS:
+        raise ConfigError(f"--kernels is {requested!r}; expected one of {', '.join(KERNELS)}")
     on_hopper = capability == HOPPER
-    if asked == "hopper" and not on_hopper:
+    if requested == "hopper" and not on_hopper:
         arch = f"{capability[0]}.{capability[1]}"
         raise ConfigError(f"--kernels hopper is for compute capability 9.0; this GPU has {arch}: leave it out")
-    if asked == "all":
+    if requested == "all":
         return ["hopper", "portable"] if on_hopper else ["portable"]
-    if asked == "auto":
+    if requested == "auto":
         return ["hopper"] if on_hopper and not forced_portable() else ["portable"]
-    return ["hopper"] if asked == "hopper" else ["portable"]
+    return ["hopper"] if requested == "hopper" else ["portable"]
 
 
-def precisions_to_tune(asked: Sequence[str], capability: tuple[int, int]) -> list[Precision]:
+def precisions_to_tune(requested: Sequence[str], capability: tuple[int, int]) -> list[Precision]:
     """None asked for: all that this GPU multiplies. Raises ConfigError for others."""
     refusal = fp8_refusal(capability)
-    if not asked:
+    if not requested:
         return ["bf16"] if refusal else ["bf16", "fp8"]
     found: list[Precision] = []
-    for name in dict.fromkeys(asked):
+    for name in dict.fromkeys(requested):
         if name not in ("bf16", "fp8"):
             raise ConfigError(f"--precision has {name!r}; tiles are measured for bf16 and fp8")
         if name == "fp8" and refusal:

@@ -66,7 +66,7 @@ class Product(ProductBench):
         first, x = self.weights[0], self.x
         sums = first.product(x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ first.float().T
         self.exact = activated(operation.operation, sums)
-        self.twin_error = relative(self.whole(self.twin(x, first)), self.exact)
+        self.reference_error = relative(self.whole(self.reference(x, first)), self.exact)
 
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None, x: Tensor | None = None) -> Tensor:
         weight, x = self.weights[copy], self.x if x is None else x
@@ -96,8 +96,8 @@ class Attention(GpuBench):
         self._allocate(operation)
         exact = self._plain(torch.float32)
         self.exact = exact.float()
-        twin = self._plain(torch.bfloat16)
-        self.twin_error = relative(self.whole(plain.as_input(twin, torch.bfloat16, self.inverse)), self.exact)
+        reference = self._plain(torch.bfloat16)
+        self.reference_error = relative(self.whole(plain.as_input(reference, torch.bfloat16, self.inverse)), self.exact)
 
     @abstractmethod
     def _allocate(self, one: Operation) -> None:
@@ -144,7 +144,7 @@ class PackedAttention(PrefixAttention):
         prompts = [np.zeros(self.each, np.int64)] * one.batch
         packed = pack_rows(
             [0] * one.batch, prompts, batch=one.batch, rows=one.rows, per_image=1, heads=self.heads
-        )  # rows are rows here: of pictures or prompts
+        )  # rows are rows here: of images or prompts
         starts, lengths = (torch.from_numpy(row.copy()).to(self.device) for row in packed.segments)
         self.segments = Segments(starts, lengths, torch.from_numpy(packed.tiles).to(self.device))
 

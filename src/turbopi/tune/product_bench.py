@@ -80,7 +80,7 @@ class ProductBench(GpuBench):
             return result
         return self.norm_behind(None if result is self.norm_behind.stream else result)
 
-    def twin(self, x: Tensor, weight: Matrix) -> Tensor:
+    def reference(self, x: Tensor, weight: Matrix) -> Tensor:
         """The plain operation."""
         if self.operation.operation == "geglu":
             return plain.linear_geglu(x, weight, self.inverse)

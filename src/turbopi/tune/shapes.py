@@ -131,7 +131,7 @@ def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kern
     v, fp8, hopper = config.vision, precision == "fp8", kernels == "hopper"
     linear, residual = ("bias", "residual") if hopper else ("plain", "parts")
     hidden = v.mlp_dim if precision == "bf16" else whole_lines(v.mlp_dim)  # see `engine.weights`
-    for images, layers in _picture_parts(config, call.cameras * call.batch):
+    for images, layers in _image_parts(config, call.cameras * call.batch):
         rows = images * v.num_tokens
         usual = Operation("", kernels, linear, precision, rows, v.width, v.width, layers, bias=True)
         yield replace(usual, name="vision qkv", columns=3 * v.width, norm_in_front="layer")
@@ -147,8 +147,8 @@ def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kern
             yield replace(projector, norm_in_front="layer")
 
 
-def _picture_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:
-    """(how many pictures, layers that run over so many): see `engine.forward.vision_tokens`."""
+def _image_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:
+    """(how many images, layers that run over so many): see `engine.forward.vision_tokens`."""
     parts = Counter(place.stop - place.start for place in places_of_parts(images))
     if parts.total() == 1:
         yield images, config.vision.depth

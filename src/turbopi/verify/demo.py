@@ -1,4 +1,4 @@
-"""The demo: real LIBERO pictures in, an action chunk out, and a check of it against the float32 oracle.
+"""The demo: real LIBERO images in, an action chunk out, and a check of it against the float32 oracle.
 
 The oracle is the eager reference in float32, given the same weights, observations and noise. The bound is a multiple of
 the control (verify/control.py), as verify/bounds.py explains.

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from turbopi.quantization.formats import told_by
+from turbopi.quantization.formats import named_by
 from turbopi.support.provenance import Provenance
 
 Number = float | None
@@ -213,4 +213,4 @@ class Certificate(Judged, frozen=True, kw_only=True):
     @property
     def calibrated(self) -> Mapping[str, object] | None:
         """What the backend tells of its calibration, as it tells it (`CalibrationDetails`); None: it has none."""
-        return told_by(self.policy.get("backend_details"))
+        return named_by(self.policy.get("backend_details"))

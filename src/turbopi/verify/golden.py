@@ -122,12 +122,12 @@ class GoldenFolder:
 
 
 def _observation(inputs: Arrays) -> Observation:
-    """Pictures as uint8 if all cameras have them so, else as the float32 the model sees."""
+    """Images as uint8 if all cameras have them so, else as the float32 the model sees."""
     names = [name.removeprefix("image_mask/") for name in inputs if name.startswith("image_mask/")]
     names.sort(key=lambda name: (CAMERAS.index(name) if name in CAMERAS else len(CAMERAS), name))
     as_uint8 = all(f"image_u8/{name}" in inputs for name in names)
 
-    def picture(name: str) -> np.ndarray:
+    def camera_image(name: str) -> np.ndarray:
         if as_uint8:
             return inputs[f"image_u8/{name}"]
         if f"image_f32/{name}" in inputs:
@@ -135,7 +135,7 @@ def _observation(inputs: Arrays) -> Observation:
         return inputs[f"image_u8/{name}"].astype(np.float32) / 255 * 2 - 1
 
     return Observation(
-        images=torch.from_numpy(np.stack([picture(name) for name in names], axis=1)),
+        images=torch.from_numpy(np.stack([camera_image(name) for name in names], axis=1)),
         image_mask=torch.from_numpy(np.stack([inputs[f"image_mask/{name}"] for name in names], axis=1)),
         tokens=torch.from_numpy(inputs["tokenized_prompt"].astype(np.int64)),
         token_mask=torch.from_numpy(inputs["tokenized_prompt_mask"].astype(bool)),

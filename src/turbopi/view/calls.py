@@ -6,7 +6,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Picture:
+class EncodedImage:
     data: bytes
     media_type: str  # "image/png", "image/jpeg"
 
@@ -28,7 +28,7 @@ class ViewedCall:
     time: float
     prompt: str
     actions: np.ndarray | None
-    pictures: dict[str, Picture] = field(default_factory=dict)
+    camera_images: dict[str, EncodedImage] = field(default_factory=dict)
     numbers: dict[str, np.ndarray] = field(default_factory=dict)
     timing: dict[str, float] = field(default_factory=dict)
 

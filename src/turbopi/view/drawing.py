@@ -1,6 +1,6 @@
 """Calls as rerun's entities, on the timelines "time" (wall clock) and "call" (the call's number).
 
-    cameras/KEY        the pictures
+    cameras/KEY        the images
     state/KEY          the observation's arrays of numbers, one series a value
     prompt             when it changes
     chunk/values       the predicted chunk [H, d], exact
@@ -69,8 +69,8 @@ class Drawing:
         self._last[call.robot] = call
         self._stream.set_time("time", timestamp=call.time)
         self._stream.set_time("call", sequence=call.number)
-        for camera, picture in call.pictures.items():
-            image = rr.EncodedImage(contents=picture.data, media_type=picture.media_type)
+        for camera, camera_image in call.camera_images.items():
+            image = rr.EncodedImage(contents=camera_image.data, media_type=camera_image.media_type)
             self._stream.log(_path(call, "cameras", camera), image)
         for key, values in call.numbers.items():
             self._stream.log(_path(call, "state", key), rr.Scalars(values))
@@ -110,7 +110,7 @@ class Drawing:
             for group in groups:
                 lines = rr.SeriesLines(names=list(group.names.values()), colors=_colors(len(group.names)))
                 self._stream.log(_path(call, "executed", group.title), lines, static=True)
-        cameras = [rrb.Spatial2DView(origin=origin("cameras", camera), name=camera) for camera in call.pictures]
+        cameras = [rrb.Spatial2DView(origin=origin("cameras", camera), name=camera) for camera in call.camera_images]
         bounds = rrb.VisualBounds2D(x_range=(0, WIDTH), y_range=(-0.05 * HEIGHT, 1.05 * HEIGHT))
         drawn = [
             rrb.Spatial2DView(origin=origin("chunk", group.title), name=_title(group), visual_bounds=bounds)

@@ -13,7 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 from turbopi.serve.page.http import FEED
 from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Preview, RobotFrame, Trouble, clean
 from turbopi.support.errors import ConfigError
-from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
+from turbopi.view.calls import EncodedImage, ViewedCall, ViewedTrouble
 
 MAX_MESSAGE = 64 * 2**20
 SILENCE = 60.0  # seconds without a frame, of which there should be some a second
@@ -36,10 +36,10 @@ class LiveServer:
             socket = connect(self.url, additional_headers=headers, max_size=MAX_MESSAGE, proxy=None)
             self._socket: ClientConnection = self._open.enter_context(socket)
         except InvalidStatus as error:
-            told = (error.response.body or b"").decode(errors="replace").strip()
+            reported = (error.response.body or b"").decode(errors="replace").strip()
             if error.response.status_code == 401:
-                told = "it wants its API key: --api-key-file FILE, or TURBOPI_API_KEY"
-            raise ConfigError(f"can't watch {url}: {clean(told) or error}") from error
+                reported = "it wants its API key: --api-key-file FILE, or TURBOPI_API_KEY"
+            raise ConfigError(f"can't watch {url}: {clean(reported) or error}") from error
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
@@ -67,7 +67,7 @@ class LiveServer:
     def watch(self, seconds: float | None = None) -> Iterator[ViewedCall | ViewedTrouble]:
         """What robots do from now on: until the server ends, or for so many seconds."""
         deadline = None if seconds is None else time.monotonic() + seconds
-        told: set[Trouble] = set()
+        reported: set[Trouble] = set()
         while True:
             left = SILENCE if deadline is None else min(SILENCE, deadline - time.monotonic())
             if left <= 0:
@@ -82,8 +82,8 @@ class LiveServer:
                 return
             assert isinstance(frame, Frame)
             yield from (_call(robot, robot.preview) for robot in frame.robots if robot.preview is not None)
-            new = [trouble for trouble in frame.troubles if trouble not in told]
-            told = set(frame.troubles)
+            new = [trouble for trouble in frame.troubles if trouble not in reported]
+            reported = set(frame.troubles)
             yield from (ViewedTrouble(one.time, clean(f"{one.error}: {one.text}")) for one in new)
 
 
@@ -94,7 +94,9 @@ def _call(robot: RobotFrame, preview: Preview) -> ViewedCall:
         time=preview.time,
         prompt=preview.prompt,
         actions=np.array(preview.actions, np.float64) if preview.actions else None,
-        pictures={name: Picture(picture.jpeg, "image/jpeg") for name, picture in preview.images.items()},
+        camera_images={
+            name: EncodedImage(camera_image.jpeg, "image/jpeg") for name, camera_image in preview.images.items()
+        },
         numbers={key: np.array(values, np.float64) for key, values in preview.numbers.items()},
         timing={stage: value for stage, value in preview.timing.items() if value is not None},
     )

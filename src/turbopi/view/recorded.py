@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image
 
 from turbopi.recordings import load_call, recorded_files
-from turbopi.support.action_groups import pictures_of
+from turbopi.support.action_groups import images_of
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading import is_finite, read_json
-from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
+from turbopi.view.calls import EncodedImage, ViewedCall, ViewedTrouble
 
 
 def robot_of(recording: Path) -> str:
@@ -55,19 +55,23 @@ def recorded(recording: Path) -> Iterator[ViewedCall | ViewedTrouble]:
             time=call.time,
             prompt=_prompt(call.observation),
             actions=_actions(call.result),
-            pictures={name: as_png(picture) for name, picture in pictures_of(call.observation).items() if picture.size},
+            camera_images={
+                name: as_png(camera_image)
+                for name, camera_image in images_of(call.observation).items()
+                if camera_image.size
+            },
             numbers=numbers_of(call.observation),
             timing=_timing(call.result),
         )
 
 
-def as_png(picture: np.ndarray) -> Picture:
+def as_png(camera_image: np.ndarray) -> EncodedImage:
     """(uint8|float)[h, w, 3] without loss, but for floats in [0, 1], which become uint8."""
-    if picture.dtype != np.uint8:
-        picture = np.round(255 * np.nan_to_num(picture)).astype(np.uint8)
+    if camera_image.dtype != np.uint8:
+        camera_image = np.round(255 * np.nan_to_num(camera_image)).astype(np.uint8)
     stream = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture)).save(stream, "PNG", compress_level=1)
-    return Picture(stream.getvalue(), "image/png")
+    Image.fromarray(np.ascontiguousarray(camera_image)).save(stream, "PNG", compress_level=1)
+    return EncodedImage(stream.getvalue(), "image/png")
 
 
 def numbers_of(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -93,8 +97,8 @@ def _actions(result: Mapping[str, Any]) -> np.ndarray | None:
 
 def _timing(result: Mapping[str, Any]) -> dict[str, float]:
     """The policy's stages, and as "server" what the server measured around the policy."""
-    told = result.get("policy_timing")
-    stages = {key.removesuffix("_ms"): value for key, value in told.items()} if isinstance(told, dict) else {}
+    reported = result.get("policy_timing")
+    stages = {key.removesuffix("_ms"): value for key, value in reported.items()} if isinstance(reported, dict) else {}
     server = result.get("server_timing")
     if isinstance(server, dict):
         stages["server"] = server.get("infer_ms")

@@ -1,6 +1,6 @@
 """An arm and an environment without hardware, for LeRobot's own commands:
 
---robot.type=fake_arm   seven joints, eight numbers of state, random pictures; it is at once where it is sent
+--robot.type=fake_arm   seven joints, eight numbers of state, random images; it is at once where it is sent
 --env.type=fake         eight numbers of state and two cameras; five steps an episode
 """
 
@@ -57,8 +57,10 @@ class FakeArm(Robot):
     def configure(self) -> None: ...
 
     def get_observation(self) -> dict[str, Any]:
-        pictures = {name: self._rng.integers(256, size=(*size, 3), dtype=np.uint8) for name, size in CAMERAS.items()}
-        return {**self._positions, "base.vel": 0.1, **pictures}
+        camera_images = {
+            name: self._rng.integers(256, size=(*size, 3), dtype=np.uint8) for name, size in CAMERAS.items()
+        }
+        return {**self._positions, "base.vel": 0.1, **camera_images}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         assert action.keys() == self._positions.keys(), action.keys()
@@ -107,11 +109,11 @@ class FakeEnv(gym.Env[dict[str, Any], np.ndarray]):
     _max_episode_steps = STEPS
 
     def __init__(self) -> None:
-        pictures: dict[str, Any] = {
+        camera_images: dict[str, Any] = {
             name: gym.spaces.Box(0, 255, (*size, 3), np.uint8) for name, size in CAMERAS.items()
         }
         state = gym.spaces.Box(-10, 10, (8,), np.float64)
-        self.observation_space = gym.spaces.Dict({"agent_pos": state, "pixels": gym.spaces.Dict(pictures)})
+        self.observation_space = gym.spaces.Dict({"agent_pos": state, "pixels": gym.spaces.Dict(camera_images)})
         self.action_space = gym.spaces.Box(-100, 100, (7,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -126,10 +128,10 @@ class FakeEnv(gym.Env[dict[str, Any], np.ndarray]):
         return np.zeros((*CAMERAS["top"], 3), np.uint8)
 
     def _seen(self) -> dict[str, Any]:
-        pictures = {
+        camera_images = {
             name: self.np_random.integers(256, size=(*size, 3), dtype=np.uint8) for name, size in CAMERAS.items()
         }
-        return {"agent_pos": self.np_random.uniform(-1, 1, 8), "pixels": pictures}
+        return {"agent_pos": self.np_random.uniform(-1, 1, 8), "pixels": camera_images}
 
 
 made_by: Any = FakeEnv  # gymnasium's type of it wants arguments that this one doesn't take

@@ -28,7 +28,7 @@ def study(
         str,
         typer.Argument(
             metavar="STUDY,STUDY,…",
-            help="; ".join(f"{name}: {asked}" for name, asked in STUDIES.items()) + ".",
+            help="; ".join(f"{name}: {requested}" for name, requested in STUDIES.items()) + ".",
             show_default=False,
         ),
     ],
@@ -90,7 +90,7 @@ def study(
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="For studies of any checkpoint: as for `turbopi infer`; else Turbo-Pi's LIBERO pictures.",
+            help="For studies of any checkpoint: as for `turbopi infer`; else Turbo-Pi's LIBERO images.",
         ),
     ] = None,
     steps: Annotated[
@@ -194,8 +194,10 @@ def _check_for_none(chosen: list[str], way: list[str] | None, simulator: str) ->
     """Raises ConfigError for options of studies in a simulator, where none of the chosen ones is one."""
     for option, given in (("--way", way), ("--simulator", None if simulator == LIBERO else simulator)):
         if given:
-            told = ", ".join(given) if isinstance(given, list) else given
-            raise ConfigError(f"{option} is {told!r}, and is for {_in_simulators()}; {', '.join(chosen)} takes none")
+            reported = ", ".join(given) if isinstance(given, list) else given
+            raise ConfigError(
+                f"{option} is {reported!r}, and is for {_in_simulators()}; {', '.join(chosen)} takes none"
+            )
 
 
 def _in_simulators() -> str:

@@ -53,7 +53,7 @@ class TurboPiConfig(PreTrainedConfig):
 
     chunk_size, max_action_dim  the model's action chunk [H, D]
     rtc_training_max_delay      the longest delay, in control steps, that training simulated; 0: none
-    image_resolution            (height, width) that pictures are resized to
+    image_resolution            (height, width) that images are resized to
     action_feature_names        of the robot's actions, in the model's order, if the checkpoint has them
 
     Raises CheckpointError if the checkpoint is of another type, and ConfigError for options that don't fit it.

@@ -218,16 +218,16 @@ class TurboPiPolicy(PreTrainedPolicy):
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK):
             if key not in batch:
                 raise ObservationError(f"the batch has no {key!r}; it has {', '.join(batch)}. Preprocess it first")
-        tokens, pictures = batch[OBS_LANGUAGE_TOKENS], self._pictures(batch)
+        tokens, camera_images = batch[OBS_LANGUAGE_TOKENS], self._images(batch)
         return Observation(
-            images=pictures,
-            image_mask=torch.ones(pictures.shape[:2], dtype=torch.bool),  # what is missing isn't sent at all
+            images=camera_images,
+            image_mask=torch.ones(camera_images.shape[:2], dtype=torch.bool),  # what is missing isn't sent at all
             tokens=tokens,
             token_mask=batch[OBS_LANGUAGE_ATTENTION_MASK].bool(),
             state=self._state(batch, len(tokens)),
         )
 
-    def _pictures(self, batch: dict[str, Tensor]) -> Tensor:
+    def _images(self, batch: dict[str, Tensor]) -> Tensor:
         """float32[B, C, 224, 224, 3] in [-1, 1] of the cameras that the batch has, in the checkpoint's order."""
         present = [key for key in self.config.image_features if key in batch]
         if not present:
@@ -236,13 +236,15 @@ class TurboPiPolicy(PreTrainedPolicy):
                 f"the batch has none of the checkpoint's cameras, {wanted}; it has {', '.join(batch)}"
             )
         size = self.config.image_resolution
-        pictures = []
+        camera_images = []
         for key in present:
-            picture = batch[key].to(torch.float32)
-            if picture.shape[1] == 3:
-                picture = picture.permute(0, 2, 3, 1)
-            pictures.append(picture if picture.shape[1:3] == size else resize_with_pad_torch(picture, *size))
-        return torch.stack(pictures, dim=1).mul_(2).sub_(1)
+            camera_image = batch[key].to(torch.float32)
+            if camera_image.shape[1] == 3:
+                camera_image = camera_image.permute(0, 2, 3, 1)
+            camera_images.append(
+                camera_image if camera_image.shape[1:3] == size else resize_with_pad_torch(camera_image, *size)
+            )
+        return torch.stack(camera_images, dim=1).mul_(2).sub_(1)
 
     def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
         """float32[B, max_action_dim]: Pi0's, padded. Pi0.5 has it in the prompt."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
-from turbopi.backends.onnx.cache import kept_export
+from turbopi.backends.onnx.cache import cached_export
 from turbopi.backends.onnx.export import EXPORT_NEEDS, missing_library
 from turbopi.checkpoint.onnx_folder import GRAPHS, Export, GraphsOnly, open_export
 from turbopi.models import family_of
@@ -75,7 +75,7 @@ class OnnxBackend(Backend):
             self.config = config  # the graphs' sizes; horizon and time grid as the folder's turbopi.json says
             self._about |= {"load_seconds": round(time.perf_counter() - began, 3), "weight_bytes": self._export.bytes}
         else:
-            self._use(kept_export(model))
+            self._use(cached_export(model))
             self._about["kept"] = True
 
     @classmethod

@@ -35,7 +35,7 @@ def default_folder() -> Path:
     return Path(named).expanduser() if named else cache_folder() / "exports"
 
 
-def kept_export(model: Pi0Model) -> Export:
+def cached_export(model: Pi0Model) -> Export:
     """The export of a float32 model on the CPU: the one that is kept, if it is there and whole, else a new one.
 
     Reads all weights for their hash. Raises what `export_onnx` raises, and OutputError if it can't be kept.

@@ -4,7 +4,7 @@ All of them are float32 with attention written out (matrix products and a float3
 host keeps what has no weights: which cameras and tokens are valid, positions, the time embedding, the Euler updates.
 
 L layers, S prefix tokens, H horizon, A action_dim, G key/value heads, K head_dim, D language-model width,
-E expert width, N pictures, P prompt tokens. The batch is 1.
+E expert width, N images, P prompt tokens. The batch is 1.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from turbopi.models.pi0.reference import Pi0Model
 
 
 class VisionGraph(nn.Module):
-    """Pictures to language-model tokens: SigLIP and the projector."""
+    """Images to language-model tokens: SigLIP and the projector."""
 
     def __init__(self, model: Pi0Model) -> None:
         super().__init__()
@@ -123,7 +123,7 @@ class Graph:
 def graphs(model: Pi0Model) -> list[Graph]:
     """The four graphs of a float32 model, in the order they run."""
     config = model.config
-    n, p, s, h = (torch.export.Dim(name) for name in ("pictures", "prompt", "prefix", "horizon"))
+    n, p, s, h = (torch.export.Dim(name) for name in ("images", "prompt", "prefix", "horizon"))
     some, horizon = 5, 7  # lengths of the examples: any but 0 and 1, which would be taken for constants
     side = config.vision.image_size
     cache = torch.zeros(config.vlm.depth, 1, config.vlm.num_kv_heads, some, config.vlm.head_dim)

@@ -5,7 +5,7 @@ from turbopi.support.errors import ConfigError
 
 
 def shapes_of(export: Export, graph: str, **lengths: int) -> dict[str, tuple[int, ...]]:
-    """Input -> shape, with lengths for the free axes by name: pictures, prompt, prefix, horizon.
+    """Input -> shape, with lengths for the free axes by name: images, prompt, prefix, horizon.
 
     Raises ConfigError for an axis without a length.
     """

@@ -280,10 +280,10 @@ class TensorRTBackend(Backend):
     def _forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone."""
         self._synchronize()  # one may still run whose call was interrupted
-        gone = {key for key in self._calls if EulerLoop(key.num_steps, key.shape.horizon) == loop}
-        for kept in [key for key in self._graphs if key[0] in gone]:
+        lost = {key for key in self._calls if EulerLoop(key.num_steps, key.shape.horizon) == loop}
+        for kept in [key for key in self._graphs if key[0] in lost]:
             del self._graphs[kept]
-        for key in gone:
+        for key in lost:
             del self._calls[key]
         if loop.steps not in {other.steps for other in self._recent}:
             self._tables.pop(loop.steps, None)

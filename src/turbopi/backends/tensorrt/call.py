@@ -145,14 +145,14 @@ class EngineCall:
         mark("denoise")
 
     def _embed(self) -> None:
-        pictures = len(self.hidden)
+        camera_images = len(self.hidden)
         table = self.weights.embed_tokens
-        self.embs[pictures:] = F.embedding(self.tokens, table) * table.shape[1] ** 0.5
+        self.embs[camera_images:] = F.embedding(self.tokens, table) * table.shape[1] ** 0.5
         if self.parts.vision is not None:
             weights = self.weights
             patches = embed_patches(self.images, weights.patch, weights.position, self.hidden.dtype)
             self.parts.vision.run(x=patches, hidden=self.hidden)
-            self.embs[:pictures] = F.linear(self.hidden.to(self.embs.dtype), *self.weights.projector)
+            self.embs[:camera_images] = F.linear(self.hidden.to(self.embs.dtype), *self.weights.projector)
 
     def _prefix(self) -> None:
         g, slots = self.config.vlm, len(self.embs)

@@ -33,7 +33,7 @@ class EngineShape:
 
 
 def vision(config: ModelConfig, weights: GetWeights, shape: EngineShape, dtype: Dtype) -> Specification:
-    """All cameras' pictures in one batch."""
+    """All cameras' images in one batch."""
     v = config.vision
     return Specification(
         f"vision-{shape.cameras}",

@@ -67,12 +67,12 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         if observation.batch_size != 1:
             raise BackendError(f"submit takes one observation at a time, not {observation.batch_size}")
         row = self._row(observation, 0)
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         with self._submitting:
             shape = self._shape(len(row.images), len(row.tokens), noise.shape[1])
             slot, buffers = self._slots[self._next], self._next
             slot.free.acquire()
-            queue_ms = (time.perf_counter() - asked) * 1e3
+            queue_ms = (time.perf_counter() - requested) * 1e3
             try:
                 key = CallKey(shape, num_steps, row.images.dtype == np.float32, buffers)
                 encode, denoise = self._captured(key)

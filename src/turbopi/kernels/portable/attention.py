@@ -1,4 +1,4 @@
-"""Attention without materialised logits: inside pictures, and of many query heads over one key/value head.
+"""Attention without materialised logits: inside images, and of many query heads over one key/value head.
 
 Twins: `vision_attention`, `attention`, `masked_softmax` of `kernels.plain`. Logits, softmax and sums are float32;
 probabilities are rounded to the values' dtype for their product, as in the twins.
@@ -25,7 +25,7 @@ def _vision_kernel(
     DIM: tl.constexpr, BLOCK_A: tl.constexpr, BLOCK_B: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr, MARKS: tl.constexpr,
 ):  # fmt: skip
-    """One head's BLOCK_M queries of one picture. A head's columns come as BLOCK_A (a power of two) and BLOCK_B more."""
+    """One head's BLOCK_M queries of one image. A head's columns come as BLOCK_A (a power of two) and BLOCK_B more."""
     image, head = tl.program_id(1) // heads, tl.program_id(1) % heads
     width = heads * DIM
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
@@ -85,7 +85,7 @@ def vision_attention(
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
+    """Self-attention inside each image: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
     With `inverse` the result leaves as `numbers`, E4M3 or int8: see `quantization.fp8`, and for `stream`
     [V * tokens, W] `kernels.plain`. Without a `tile`, that of `tiles`, else the usual one.

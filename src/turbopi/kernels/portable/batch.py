@@ -31,25 +31,25 @@ BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: key
 
 
 @triton.jit
-def _embed_kernel(source, pictures, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
+def _embed_kernel(source, images, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
     row = tl.program_id(0).to(tl.int64)
     cols = tl.arange(0, BLOCK)
     wait_for_producer(PDL)
     launch_dependents(PDL)
     place = tl.load(source + row)
     if place >= 0:
-        tl.store(out + row * width + cols, tl.load(pictures + place * width + cols, cols < width, 0.0), cols < width)
+        tl.store(out + row * width + cols, tl.load(images + place * width + cols, cols < width, 0.0), cols < width)
     else:
         x = tl.load(table + (-1 - place) * width + cols, cols < width, 0.0).to(tl.float32)
         tl.store(out + row * width + cols, (x * scale).to(out.dtype.element_ty), cols < width)
 
 
-def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> None:
+def embed_rows(source: Tensor, images: Tensor, table: Tensor, out: Tensor) -> None:
     """See `kernels.plain_batch.embed_rows`. All contiguous."""
-    assert all(t.is_contiguous() for t in (source, pictures, table, out)), "rows are read as they lie in memory"
+    assert all(t.is_contiguous() for t in (source, images, table, out)), "rows are read as they lie in memory"
     width = table.shape[1]
     _embed_kernel[(len(source),)](
-        source, pictures, table, out, width, width**0.5,
+        source, images, table, out, width, width**0.5,
         BLOCK=triton.next_power_of_2(width), num_warps=4, **dependent_launch(out),
     )  # fmt: skip
 

@@ -65,7 +65,7 @@ def _embed_kernel(tokens, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl
 
 
 def patch_rows(images: Tensor, patch: int) -> Tensor:
-    """Pictures (uint8|float32)[V, S, S, 3] -> their patches in [-1, 1], float32[V * tokens, 3 * patch * patch]."""
+    """Images (uint8|float32)[V, S, S, 3] -> their patches in [-1, 1], float32[V * tokens, 3 * patch * patch]."""
     assert images.is_contiguous(), "images are read as they lie in memory"
     n, size = images.shape[:2]
     side, width = size // patch, 3 * patch * patch
@@ -78,7 +78,7 @@ def patch_rows(images: Tensor, patch: int) -> Tensor:
 
 
 def odd_rows(images: Tensor, patch: int, dtype: torch.dtype = torch.bfloat16) -> Tensor:
-    """255 times `patch_rows` of uint8 pictures, twice side by side: [V * tokens, 2 * 3 * patch * patch].
+    """255 times `patch_rows` of uint8 images, twice side by side: [V * tokens, 2 * 3 * patch * patch].
 
     These are the odd numbers 2 u - 255, which bfloat16 holds exactly.
     """

@@ -31,8 +31,8 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
         rope_split=rope.rope_split,
         vision_attention=partial(attention.vision_attention, tiles=tiles),
         attention=partial(attend, tiles=tiles),
-        resize_pictures=resize.resize_pictures,
-        backward=vjp.way_back,
+        resize_images=resize.resize_images,
+        backward=vjp.backward_form,
         batch=batch.batch_ops(tiles),
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
@@ -44,7 +44,7 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
             "suffix attention": "cuBLAS and Triton's softmax",
             "the expert with a way back": vjp.ORIGIN,
             "LayerNorm": "Triton",
-            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes, transfers": "Triton",
+            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, images' sizes, transfers": "Triton",
         },
     )
 

@@ -55,7 +55,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         vision_attention=attention_of_images,
         vision=FusedVision(attention_of_images, tiles),
         attention=partial(attend, tiles=tiles),
-        backward=vjp.way_back,
+        backward=vjp.backward_form,
         batch=replace(
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),

@@ -1,4 +1,4 @@
-"""The prefix: pictures and prompt to one sequence, and that sequence to keys and values.
+"""The prefix: images and prompt to one sequence, and that sequence to keys and values.
 
 Bidirectional attention among the valid tokens. The last layer's queries, its MLP and the final norm would change no
 key and no value, so they aren't computed.
@@ -16,7 +16,7 @@ from turbopi.models.pi0.vision import VisionTower
 
 
 def embed_images(vision: VisionTower, projector: torch.nn.Linear, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Pictures [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W]).
+    """Images [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W]).
 
     Image tokens are not multiplied by √D, unlike prompt tokens.
     """

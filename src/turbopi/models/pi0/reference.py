@@ -143,9 +143,9 @@ class Pi0Model(nn.Module):
         if isinstance(conditioning, Sequence):
             return self._denoise_rows(cache, noise, num_steps, conditioning, trace)
         config, horizon = self.config, noise.shape[1]
-        asked = conditioning or Conditioning()
-        asked.check(num_steps, horizon, config.action_dim)
-        tokens, guidance = asked.token_times(num_steps, horizon, config.time_grid), asked.guidance
+        requested = conditioning or Conditioning()
+        requested.check(num_steps, horizon, config.action_dim)
+        tokens, guidance = requested.token_times(num_steps, horizon, config.time_grid), requested.guidance
         distinct = tokens.distinct()
         rows = tokens.rows(distinct)
         time_embs = time_embedding(distinct, config.expert.width).to(noise.device)  # [U, D]
@@ -157,10 +157,10 @@ class Pi0Model(nn.Module):
         def on_device(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array).to(noise.device)
 
-        solver = None if asked.integration is None or asked.integration.is_euler else asked.integration
+        solver = None if requested.integration is None or requested.integration.is_euler else requested.integration
         x_t, steps = noise, []
-        if asked.held is not None and asked.values is not None:
-            x_t = torch.where(on_device(asked.held)[:, None], on_device(asked.values), noise)
+        if requested.held is not None and requested.values is not None:
+            x_t = torch.where(on_device(requested.held)[:, None], on_device(requested.values), noise)
         by_row = on_device(rows)
         times, dt = on_device(tokens.times)[..., None], on_device(tokens.steps)[..., None]  # [N, H, 1]
         hidden: list[Tensor] = []
@@ -217,9 +217,9 @@ class Pi0Model(nn.Module):
     ) -> Tensor:
         """Each row of a batch with a conditioning of its own."""
         traces: list[Trace] = []
-        for row, asked in enumerate(of_rows(conditioning, noise.shape[0])):
+        for row, requested in enumerate(of_rows(conditioning, noise.shape[0])):
             traces.append({})
-            one = Conditioning() if asked is None else asked  # so that all rows' traces have the same shapes
+            one = Conditioning() if requested is None else requested  # so that all rows' traces have the same shapes
             self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=traces[-1])
         joined = {
             name: torch.cat([one[name] for one in traces], dim=int(name != "actions"))
@@ -234,7 +234,7 @@ class Pi0Model(nn.Module):
     @torch.no_grad()
     @exact_float32()
     def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
-        """Pictures and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
+        """Images and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
         per_image = self.config.vision.num_tokens
         layout = PrefixLayout.of(observation, per_image, compact=compact)
         lengths = layout.pad_mask.sum(1)
@@ -270,7 +270,7 @@ class Pi0Model(nn.Module):
         return KVCache(k, v, layout.mask, embedded.lengths, embedded.state)
 
     def embed_images(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Pictures [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W])"""
+        """Images [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W])"""
         return embed_images(self.vision, self.projector, images)
 
     def encode_prefix(self, embs: Tensor, positions: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -14,12 +14,14 @@ class Sample:
     stage_ms: dict[str, float] = field(default_factory=dict)
     queue_ms: float = 0.0  # of a `submit`: how long it waited for a free place before it began
 
-    def timing(self, start: float, asked: float, infer_start: float, infer_end: float, end: float) -> dict[str, float]:
+    def timing(
+        self, start: float, requested: float, infer_start: float, infer_end: float, end: float
+    ) -> dict[str, float]:
         """`policy_timing` of a call, from its times in seconds: see `UnifiedPolicy.infer`."""
         return {
             "infer_ms": (infer_end - infer_start) * 1e3,
-            "preprocess_ms": (asked - start) * 1e3,
-            "queue_ms": (infer_start - asked) * 1e3,
+            "preprocess_ms": (requested - start) * 1e3,
+            "queue_ms": (infer_start - requested) * 1e3,
             **{f"{stage}_ms": milliseconds for stage, milliseconds in self.stage_ms.items()},
             "postprocess_ms": (end - infer_end) * 1e3,
             "total_ms": (end - start) * 1e3,

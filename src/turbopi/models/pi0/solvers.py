@@ -150,9 +150,9 @@ def checked_times(times: Sequence[float]) -> tuple[float, ...]:
         raise ObservationError(f"the time grid is {shown(list(times))}; it should be numbers")
     rounded = tuple(float(np.float32(t)) for t in times)
     if not 0 < rounded[0] <= 1 or rounded[-1] != 0 or not all(t > s for t, s in pairwise(rounded)):
-        told = f"[{', '.join(f'{t:g}' for t in rounded)}]"
+        reported = f"[{', '.join(f'{t:g}' for t in rounded)}]"
         raise ObservationError(
-            f"the time grid is {shown(told)}; its times should fall strictly, from 1 (noise) to 0 (actions)"
+            f"the time grid is {shown(reported)}; its times should fall strictly, from 1 (noise) to 0 (actions)"
         )
     return rounded
 
@@ -172,18 +172,18 @@ def checked_grid(grid: TimeGrid) -> GridName | tuple[float, ...]:
 
 
 @lru_cache
-def _evaluations(asked: Integration) -> tuple[tuple[float, Row], ...]:
+def _evaluations(requested: Integration) -> tuple[tuple[float, Row], ...]:
     """Time and row of each evaluation, both of float32 numbers."""
 
     def rounded(x: float) -> float:
         return float(np.float32(x))
 
-    return tuple((rounded(t), Row(*map(rounded, row))) for t, row in _in_float64(asked))
+    return tuple((rounded(t), Row(*map(rounded, row))) for t, row in _in_float64(requested))
 
 
-def _in_float64(asked: Integration) -> Iterator[tuple[float, Row]]:
-    solver, spans = asked.solver, list(pairwise(asked.times))
-    twice = asked.evaluations - len(spans) if solver in _TWICE else 0
+def _in_float64(requested: Integration) -> Iterator[tuple[float, Row]]:
+    solver, spans = requested.solver, list(pairwise(requested.times))
+    twice = requested.evaluations - len(spans) if solver in _TWICE else 0
     before: float | None = None
     for number, (t, s) in enumerate(spans):
         step = s - t

@@ -1,4 +1,4 @@
-"""SigLIP So400m/14: pictures to tokens. 27 pre-LayerNorm blocks with biases everywhere; no CLS token, no pooling."""
+"""SigLIP So400m/14: images to tokens. 27 pre-LayerNorm blocks with biases everywhere; no CLS token, no pooling."""
 
 import torch
 import torch.nn.functional as F
@@ -47,7 +47,7 @@ class EncoderLayer(nn.Module):
 
 
 class VisionTower(nn.Module):
-    """Pictures (uint8|float32)[N, 224, 224, 3] -> tokens [N, 256, W], row-major over the patches."""
+    """Images (uint8|float32)[N, 224, 224, 3] -> tokens [N, 256, W], row-major over the patches."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()

@@ -8,7 +8,7 @@ from PIL import Image
 
 from turbopi.realtime.wire import unpack
 from turbopi.serve.page.messages import Preview, Thumbnail, clean
-from turbopi.support.action_groups import pictures_of
+from turbopi.support.action_groups import images_of
 
 THUMBNAIL = 224  # pixels of the longer side
 IMAGES = 4
@@ -54,7 +54,7 @@ def _numbers(observation: Mapping[str, object]) -> dict[str, list[float | None]]
 
 
 def _images(observation: Mapping[str, object]) -> dict[str, Thumbnail]:
-    shown = list(pictures_of(observation).items())[:IMAGES]
+    shown = list(images_of(observation).items())[:IMAGES]
     return {clean(camera, 60): thumbnail(image) for camera, image in shown if image.size}
 
 

@@ -48,8 +48,8 @@ def as_document(
     except msgspec.ValidationError as reason:
         path, found, expected = _misfit(value, kind, "")
         path = path.removeprefix(".") or "its value"
-        told = "missing" if found is _MISSING else shown(found)
-        raise error(f"{where}: {path} is {told}; expected {said(expected)}{hint}") from reason
+        reported = "missing" if found is _MISSING else shown(found)
+        raise error(f"{where}: {path} is {reported}; expected {said(expected)}{hint}") from reason
 
 
 def plain_document(document: msgspec.Struct) -> dict[str, object]:

@@ -44,10 +44,10 @@ def one_line(error: Exception) -> str:
 
 def listing(names: Sequence[str], limit: int = 5) -> str:
     """`a, b, c and 7 more (10 in all)`; a name that can't be printed on a line as it is in quotes."""
-    told = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
+    reported = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
     if len(names) > limit:
-        told += f" and {len(names) - limit} more ({len(names)} in all)"
-    return told
+        reported += f" and {len(names) - limit} more ({len(names)} in all)"
+    return reported
 
 
 def read_bytes(file: str | Path, error: Error = CheckpointError, *, limit: int, hint: str = "") -> bytes:

@@ -1,4 +1,4 @@
-"""Pictures in files."""
+"""Images in files."""
 
 import warnings
 from pathlib import Path
@@ -9,13 +9,13 @@ from PIL import Image
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading.files import open_file
 
-PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")  # of files: each is decoded by Pillow itself, in this process
-MAX_PIXELS = 50_000_000  # of a picture in a file
+IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")  # of files: each is decoded by Pillow itself, in this process
+MAX_PIXELS = 50_000_000  # of an image in a file
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")  # 8 bits a channel, or fewer
 
 
-def read_picture(file: str | Path) -> np.ndarray:
-    """The picture in a file, RGB uint8[h, w, 3]; transparency is dropped.
+def read_image(file: str | Path) -> np.ndarray:
+    """The image in a file, RGB uint8[h, w, 3]; transparency is dropped.
 
     Raises ObservationError for what is none of PICTURE_FORMATS (whatever its name; an EPS would be handed to
     Ghostscript), is damaged, has more than MAX_PIXELS, which is checked before anything is decoded, or has more than 8
@@ -25,7 +25,7 @@ def read_picture(file: str | Path) -> np.ndarray:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # refused below
-                image = Image.open(stream, formats=PICTURE_FORMATS)
+                image = Image.open(stream, formats=IMAGE_FORMATS)
             if image.width * image.height > MAX_PIXELS:
                 raise ObservationError(
                     f"{file} has {image.width} x {image.height} pixels; at most {MAX_PIXELS} are read"
@@ -40,6 +40,5 @@ def read_picture(file: str | Path) -> np.ndarray:
         except Exception as reason:  # damage makes Pillow's decoders raise a dozen classes
             why = " ".join(str(reason).split())[:200].replace(repr(stream), "it")
             raise ObservationError(
-                f"{file} is neither a readable picture nor .npy: {why}. Pictures are read as "
-                + ", ".join(PICTURE_FORMATS)
+                f"{file} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(IMAGE_FORMATS)
             ) from reason

@@ -3,7 +3,7 @@
     export MUJOCO_GL=egl
     alias small_policy='python -m turbopi_lab.small_policy'
     small_policy measure --initial-states 0-49             how good the expert is
-    small_policy stats --out work/norm_stats.json          statistics of demonstrations, without pictures
+    small_policy stats --out work/norm_stats.json          statistics of demonstrations, without images
     small_policy train --out work/run --stats work/norm_stats.json --seconds 420 --workers 32
     small_policy play --help                               episodes from machines without a GPU, for `train`
     small_policy judged --help                             what evaluations came to, in one file
@@ -84,7 +84,7 @@ def main() -> None:
     _add_post(commands.add_parser("post", help="one of two policies that differ in their demonstrations, see post.py"))
     _add_distill(commands.add_parser("distill", help="a student that takes one denoising step, see distill.py"))
     speed = commands.add_parser("throughput", help="time training steps on random data")
-    playing = commands.add_parser("play", help="play episodes and keep them without pictures, for train --tapes")
+    playing = commands.add_parser("play", help="play episodes and keep them without images, for train --tapes")
     playing.add_argument("--out", type=Path, required=True, help="a folder; several runs may share it")
     playing.add_argument("--seconds", type=float, required=True)
     playing.add_argument("--seed", type=int, required=True, help="another one for each run")

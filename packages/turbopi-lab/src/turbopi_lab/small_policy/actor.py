@@ -1,4 +1,4 @@
-"""The learner at the wheel: chunks for a few pictures at once, with the newest averaged weights, in bfloat16."""
+"""The learner at the wheel: chunks for a few images at once, with the newest averaged weights, in bfloat16."""
 
 from collections.abc import Sequence
 
@@ -38,7 +38,7 @@ class Actor:
         }
         self.model = Pi0Model.from_state(config, state)
         self._all_tokens, self._all_masks = tokens.to(device), token_mask.to(device)
-        self.pictures = torch.zeros(rows, 2, IMAGE_PX, IMAGE_PX, 3, dtype=torch.uint8, device=device)
+        self.camera_images = torch.zeros(rows, 2, IMAGE_PX, IMAGE_PX, 3, dtype=torch.uint8, device=device)
         self.tokens = self._all_tokens[:1].repeat(rows, 1)
         self.token_mask = self._all_masks[:1].repeat(rows, 1)
         self.noise = torch.zeros(rows, HORIZON, config.action_dim, device=device)
@@ -71,18 +71,18 @@ class Actor:
         with torch.cuda.graph(self._graph, stream=self._stream):
             self._out = self._compute()
 
-    def act(self, pictures: np.ndarray, prompts: list[int], held: Sequence[np.ndarray] = ()) -> np.ndarray:
+    def act(self, camera_images: np.ndarray, prompts: list[int], held: Sequence[np.ndarray] = ()) -> np.ndarray:
         """uint8[n, 2, 224, 224, 3], n <= rows -> normalised actions float32[n, H, action_dim].
 
         held   for each row the actions [d, <= action_dim], normalised, that its chunk begins with; none: d is 0
         """
-        n = len(pictures)
+        n = len(camera_images)
         given, mask = np.zeros(self.given[:n].shape, np.float32), np.zeros((n, HORIZON), bool)
         for row, actions in enumerate(held):
             given[row, : len(actions), : actions.shape[-1]] = actions
             mask[row, : len(actions)] = True
         with torch.cuda.stream(self._stream), torch.no_grad():
-            self.pictures[:n].copy_(torch.from_numpy(pictures))
+            self.camera_images[:n].copy_(torch.from_numpy(camera_images))
             chosen = torch.tensor(prompts, device=self.device)
             self.tokens[:n] = self._all_tokens[chosen]
             self.token_mask[:n] = self._all_masks[chosen]
@@ -95,16 +95,16 @@ class Actor:
             return self._compute()[:n].cpu().numpy()
 
     def chunks(
-        self, scale: Normalizer, pictures: np.ndarray, prompts: list[int], held: Sequence[np.ndarray]
+        self, scale: Normalizer, camera_images: np.ndarray, prompts: list[int], held: Sequence[np.ndarray]
     ) -> np.ndarray:
         """As `act`, with held actions [d, 7] and chunks float64[n, H, 7] in the robot's units."""
-        actions = self.act(pictures, prompts, [scale.normalize(one) for one in held])
+        actions = self.act(camera_images, prompts, [scale.normalize(one) for one in held])
         return scale.unnormalize(actions)[..., :7]
 
     @torch.no_grad()
     def _compute(self) -> Tensor:
         model, config = self.model, self.config
-        images = embed_images(model.vision, model.projector, self.pictures)[0]
+        images = embed_images(model.vision, model.projector, self.camera_images)[0]
         x = torch.cat((images, embed_prompt(model.vlm, self.tokens)), dim=1)
         cameras = torch.ones(self.rows, images.shape[1], dtype=torch.bool, device=self.device)
         valid = torch.cat((cameras, self.token_mask), dim=1)

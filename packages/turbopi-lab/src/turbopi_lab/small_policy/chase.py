@@ -33,7 +33,7 @@ from turbopi_lab.small_policy.start import fresh_model, trained_model
 HORIZON = 16
 MOST_DELAY = 6
 EXECUTED = (3, 8)  # actions of a chunk that the demonstrating expert carries out
-GUIDED = 8  # numbers that the guide tells from the pictures: target, where it was, tip, and from tip to target
+GUIDED = 8  # numbers that the guide tells from the images: target, where it was, tip, and from tip to target
 GUIDE_WEIGHT = 0.5
 WEIGHTS = torch.tensor([1.0, 1.0] + [0.02] * 30)  # of the loss, by dimension: the tip's, then what does nothing
 _STACK = GemmaConfig(width=64, mlp_dim=128, depth=3, num_heads=4, num_kv_heads=1, head_dim=16)
@@ -74,7 +74,7 @@ class Settings:
 
 @dataclass
 class Frames:
-    """N frames of demonstrations, whose pictures are drawn when they are used."""
+    """N frames of demonstrations, whose images are drawn when they are used."""
 
     places: Tensor  # float32[N, 3, 2]  of the target, of where it was, of the tip
     chunks: Tensor  # float32[N, H, 2]
@@ -98,7 +98,7 @@ class Frames:
         change = torch.stack((torch.stack((cos, sin), -1), torch.stack((-sin * mirror, cos * mirror), -1)), -2)
         return Frames(self.places[rows] @ change, self.chunks[rows] @ change, self.delays[rows])
 
-    def pictures(self, px: int) -> Tensor:
+    def camera_images(self, px: int) -> Tensor:
         """float32[N, 2, px, px, 3] in [-1, 1]: as `Chase.draw`, but for the rounding."""
         tip = self.places[:, 2]
         return torch.stack((self._view(torch.zeros_like(tip), VIEWS[0], px), self._view(tip, VIEWS[1], px)), dim=1)
@@ -149,9 +149,9 @@ def _play(number: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ahead[rng.uniform(size=number) < 0.25] = 0
         chunks, _ = _continued(world, running, ahead, sides, rng)
         frames.append((np.stack((world.target, world.before[:, 0], world.tip), axis=1), chunks, ahead))
-        asked = since >= every
-        if asked.any():
-            rows = np.flatnonzero(asked)
+        requested = since >= every
+        if requested.any():
+            rows = np.flatnonzero(requested)
             chosen, sides[rows] = _continued(world.rows(rows), running[rows], delay[rows], sides[rows], rng)
             running = running.copy()
             running[rows], since[rows] = _padded(chosen), 0
@@ -254,15 +254,15 @@ class Trainer:
         held = held_actions(batch.delays.repeat_interleave(repeats, 0), HORIZON)
         noise, t = torch.randn_like(actions), draw_times(len(actions), self.device)
         tokens, mask = self.tokens.expand(rows, -1), self.mask.expand(rows, -1)
-        x, pictures = mixed(actions, noise, t, held), batch.pictures(CONFIG.model.vision.image_size)
-        predicted, hidden = velocity(self.model, pictures, tokens, mask, x, t, held=held)
+        x, camera_images = mixed(actions, noise, t, held), batch.camera_images(CONFIG.model.vision.image_size)
+        predicted, hidden = velocity(self.model, camera_images, tokens, mask, x, t, held=held)
         guessed, _ = self.guide(hidden, mask)
         guide = torch.nn.functional.smooth_l1_loss(guessed, batch.guided(), beta=0.1)
         return flow_loss(predicted, noise - actions, self._weights, held), guide
 
 
 def _see_dots(model: Pi0Model) -> None:
-    """Pictures are mostly dark, with small dots: begin with patches that see nothing in the dark, and dots well."""
+    """Images are mostly dark, with small dots: begin with patches that see nothing in the dark, and dots well."""
     with torch.no_grad():
         patches = model.vision.patch_embedding
         patches.weight.mul_(5)
@@ -278,14 +278,14 @@ def prompt() -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def sample(model: Pi0Model, pictures: Tensor, noise: Tensor, given: Tensor, delay: int, steps: int = 5) -> Tensor:
+def sample(model: Pi0Model, camera_images: Tensor, noise: Tensor, given: Tensor, delay: int, steps: int = 5) -> Tensor:
     """Chunks [N, H, action_dim] whose first `delay` actions are those of `given`."""
     tokens, mask = (tensor.to(noise.device).expand(len(noise), -1) for tensor in prompt())
     held = held_actions(torch.full((len(noise),), delay, device=noise.device), HORIZON)
     x = torch.where(held[..., None], given, noise)
     for step in range(steps):
         t = torch.full((len(x),), 1 - step / steps, device=x.device)
-        v, _ = velocity(model, pictures, tokens, mask, x, t, held=held)
+        v, _ = velocity(model, camera_images, tokens, mask, x, t, held=held)
         x = torch.where(held[..., None], given, x - v / steps)
     return x
 
@@ -300,9 +300,9 @@ def watch(model: Pi0Model, delay: int, trained: bool, episodes: int = 100, every
     noises = torch.Generator().manual_seed(0)
 
     def ask(given: Tensor, d: int) -> Tensor:
-        pictures = torch.from_numpy(world.draw(CONFIG.model.vision.image_size)).to(device)
+        camera_images = torch.from_numpy(world.draw(CONFIG.model.vision.image_size)).to(device)
         noise = torch.randn(episodes, HORIZON, CONFIG.model.action_dim, generator=noises).to(device)
-        return sample(model, pictures, noise, given, d)
+        return sample(model, camera_images, noise, given, d)
 
     chunk = ask(torch.zeros(episodes, HORIZON, CONFIG.model.action_dim, device=device), 0)
     solved, place, arrives = np.zeros(episodes, np.bool_), 0, -1
@@ -335,11 +335,11 @@ def train(settings: Settings) -> None:
         if time.monotonic() - watched > settings.watch_every:
             watched = time.monotonic()
             trainer.save(settings.out / "state.pt")
-            rows.append(_told(trainer, losses, watched - started))
+            rows.append(_reported(trainer, losses, watched - started))
             losses.clear()
     trainer.save(settings.out / "state.pt")
     if losses:
-        rows.append(_told(trainer, losses, time.monotonic() - started))
+        rows.append(_reported(trainer, losses, time.monotonic() - started))
     with (settings.out / "curves.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -352,7 +352,7 @@ def train(settings: Settings) -> None:
     )
 
 
-def _told(trainer: Trainer, losses: list[tuple[float, float]], seconds: float) -> dict[str, float]:
+def _reported(trainer: Trainer, losses: list[tuple[float, float]], seconds: float) -> dict[str, float]:
     model = Pi0Model(CONFIG.model).to(trainer.device)
     model.load_state_dict(trainer.average)
     row = {"seconds": round(seconds), "step": trainer.steps, **_mean(losses)}

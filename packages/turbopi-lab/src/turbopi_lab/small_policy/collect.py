@@ -5,9 +5,9 @@ states of its own making (DAgger), at times with the delays of a slow machine. B
 and then, and its actions are carried out with noise; labels have none.
 
 Messages to the trainer   ("ready",)
-                          ("look", pictures uint8[2, 224, 224, 3], prompt, held float[d, 7])
+                          ("look", images uint8[2, 224, 224, 3], prompt, held float[d, 7])
                               answered with a chunk float[H, 7] that begins with `held`, or None
-                          ("frames", Record, pictures as bytes)
+                          ("frames", Record, images as bytes)
 """
 
 from collections.abc import Sequence
@@ -48,9 +48,9 @@ class Mix:
 
 
 class Player:
-    """Plays one scene's episodes; `ask(pictures, prompt, held)` gives the learner's chunk, or None to stop.
+    """Plays one scene's episodes; `ask(images, prompt, held)` gives the learner's chunk, or None to stop.
 
-    draws   keep frames with their pictures; otherwise cameras are drawn for the learner alone
+    draws   keep frames with their images; otherwise cameras are drawn for the learner alone
     """
 
     def __init__(self, scene: int, seed: int, ask: Any, *, draws: bool = True) -> None:
@@ -74,13 +74,13 @@ class Player:
         return kind, self.episode
 
     def draw(self, tape: Tape) -> np.ndarray:
-        """The pictures of a tape's frames: uint8[n, 2, 224, 224, 3]."""
+        """The images of a tape's frames: uint8[n, 2, 224, 224, 3]."""
         self.world.place_bodies(tape.bodies)
         drawn = []
         for joints in tape.joints:
             self.world.place_joints(joints)
             self._draw()
-            drawn.append(self._pictures())
+            drawn.append(self._images())
         return np.array(drawn, np.uint8).reshape(-1, 2, IMAGE_PX, IMAGE_PX, 3)
 
     def _setting(self, kind: Kind, mix: Mix) -> Setting:
@@ -131,7 +131,7 @@ class Player:
         return int(self.rng.integers(2, 6))
 
     def _let_learner(self, steps: int, delay: int = 0, lead: int = 0) -> None:
-        """The learner drives, with a new chunk every REPLAN steps, which takes over `delay` steps after its pictures.
+        """The learner drives, with a new chunk every REPLAN steps, which takes over `delay` steps after its images.
 
         A frame is kept `lead` steps before the end, unless that is 0.
         """
@@ -149,14 +149,14 @@ class Player:
                 self._keep_frame(sight, lead)
             if (step - began) % REPLAN == 0:
                 held = ahead[:delay]  # nothing at first: there is no chunk yet, and the world waits
-                fresh, takes_over = self.ask(self._pictures(), self.episode.setting.prompt, held), step + len(held)
+                fresh, takes_over = self.ask(self._images(), self.episode.setting.prompt, held), step + len(held)
                 if fresh is None:
                     raise EOFError
                 since = step
             if fresh is not None and step == takes_over:
                 ahead, fresh = fresh[step - since :], None
-            asks, films = (step + 1 - began) % REPLAN == 0, self.draws and lead > 0 and step + 1 == filmed
-            self._step(ahead[0], label, by_expert=False, look=asks or films)
+            asks, videos = (step + 1 - began) % REPLAN == 0, self.draws and lead > 0 and step + 1 == filmed
+            self._step(ahead[0], label, by_expert=False, look=asks or videos)
             ahead = ahead[1:]
 
     # --- steps --------------------------------------------------------------------------------------------------------
@@ -174,22 +174,22 @@ class Player:
 
     def _draw_if_needed(self) -> None:
         """When the expert hands over between frames: what the cameras see now, without a step."""
-        if not self.world._pictures:
+        if not self.world._images:
             self._draw()
 
     def _draw(self) -> None:
-        self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
+        self.world._images = dict(zip(CAMERAS, self.world.draw(), strict=True))
 
-    def _pictures(self) -> np.ndarray:
-        return np.stack([resize_with_pad(self.world._pictures[key], IMAGE_PX, IMAGE_PX) for key in CAMERAS])
+    def _images(self) -> np.ndarray:
+        return np.stack([resize_with_pad(self.world._images[key], IMAGE_PX, IMAGE_PX) for key in CAMERAS])
 
     def _keep_frame(self, sight: Sight, lead: int = 0) -> None:
-        """Before the step that it is for. Without pictures there is no frame, where they are kept."""
-        if self.draws and not self.world._pictures:
+        """Before the step that it is for. Without images there is no frame, where they are kept."""
+        if self.draws and not self.world._images:
             return
-        pictures = self._pictures() if self.draws else None
+        camera_images = self._images() if self.draws else None
         step, state = len(self.episode.labels), openpi_state(self.world._obs)
-        frame = Frame(step, lead, pictures, sight, self.expert.phase, state, self.world.joints())
+        frame = Frame(step, lead, camera_images, sight, self.expert.phase, state, self.world.joints())
         self.episode.frames.append(frame)
 
 
@@ -200,9 +200,9 @@ def run_worker(connection: Connection, scene: int, seed: int, tapes: Sequence[Ta
     """
     mix = Mix()
 
-    def ask(pictures: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray | None:
+    def ask(camera_images: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray | None:
         nonlocal mix
-        connection.send(("look", pictures, prompt, held))
+        connection.send(("look", camera_images, prompt, held))
         while True:
             answer = connection.recv()
             if answer[0] == "mix":
@@ -210,9 +210,9 @@ def run_worker(connection: Connection, scene: int, seed: int, tapes: Sequence[Ta
             else:
                 return answer[1] if answer[0] == "chunk" else None
 
-    def send(record: Record, pictures: np.ndarray) -> None:
+    def send(record: Record, camera_images: np.ndarray) -> None:
         connection.send(("frames", record))
-        connection.send_bytes(pictures.reshape(-1).data if pictures.size else b"")
+        connection.send_bytes(camera_images.reshape(-1).data if camera_images.size else b"")
 
     try:
         player = Player(scene, seed, ask)
@@ -226,6 +226,6 @@ def run_worker(connection: Connection, scene: int, seed: int, tapes: Sequence[Ta
                     return
                 mix = answer[1]
             kind, episode = player.play(mix)
-            send(episode.record(kind), episode.pictures())
+            send(episode.record(kind), episode.camera_images())
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return

@@ -116,10 +116,10 @@ def _columns(frames: Frames) -> tuple[Tensor, Tensor, Tensor]:
 
 def _ways(teacher: Pi0Model, frames: Frames, prompt: tuple[Tensor, Tensor], noises: int) -> Ways:
     config, count = teacher.config, len(frames)
-    pictures = frames.pictures(config.vision.image_size)
+    camera_images = frames.camera_images(config.vision.image_size)
     tokens, mask = (tensor.expand(count, -1) for tensor in prompt)
-    there, state = torch.ones(count, pictures.shape[1], dtype=torch.bool), torch.zeros(count, config.action_dim)
-    cache = teacher.prefix(Observation(pictures, there, tokens, mask, state))
+    there, state = torch.ones(count, camera_images.shape[1], dtype=torch.bool), torch.zeros(count, config.action_dim)
+    cache = teacher.prefix(Observation(camera_images, there, tokens, mask, state))
     points = []
     for _ in range(noises):
         trace: Trace = {}

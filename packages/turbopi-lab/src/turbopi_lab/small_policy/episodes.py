@@ -4,7 +4,7 @@ An expert's chunk is only right if the expert goes on to act as it says. So a fr
 the HORIZON steps from it on. Its first steps, up to `lead` of them, may be the learner's: those are never learned, but
 held, as actions are that a robot carries out while it waits for the rest of a chunk (forward.py).
 
-A frame can be kept without its pictures: a `Tape` has the physics to draw them from, on a machine with a GPU.
+A frame can be kept without its images: a `Tape` has the physics to draw them from, on a machine with a GPU.
 """
 
 from collections.abc import Iterable, Iterator
@@ -27,7 +27,7 @@ Kind = Literal["demonstration", "dagger", "trial"]
 
 @dataclass
 class Record:
-    """`n` labelled frames of one episode, without their pictures.
+    """`n` labelled frames of one episode, without their images.
 
     chunks     float32[n, H, 7]: the expert's actions, without the noise that some are carried out with
     executed   float32[n, H, 7]: those that were carried out
@@ -59,11 +59,11 @@ class Tape:
 
 @dataclass
 class Frame:
-    """A moment that may be labelled; `pictures` uint8[2, 224, 224, 3], or None if it is to be drawn later."""
+    """A moment that may be labelled; `images` uint8[2, 224, 224, 3], or None if it is to be drawn later."""
 
     step: int
     lead: int
-    pictures: np.ndarray | None
+    camera_images: np.ndarray | None
     sight: Sight
     phase: str
     state: np.ndarray
@@ -112,9 +112,9 @@ class Episode:
             states=np.array([frame.state for frame in frames], np.float32).reshape(-1, 8),
         )
 
-    def pictures(self) -> np.ndarray:
+    def camera_images(self) -> np.ndarray:
         """uint8[n, 2, 224, 224, 3] of the labelled frames, all of which were drawn."""
-        drawn = [frame.pictures for frame in self.labelled]
+        drawn = [frame.camera_images for frame in self.labelled]
         return np.array(drawn, np.uint8).reshape(-1, 2, IMAGE_PX, IMAGE_PX, 3)
 
     def tape(self, kind: Kind, bodies: np.ndarray) -> Tape:
@@ -158,8 +158,8 @@ def load_tapes(files: Iterable[Path]) -> Iterator[Tape]:
             arrays = {name: found[name] for name in found.files}
         ends = np.cumsum(arrays["frames"])
         plain = msgspec.json.decode(arrays["plain"].tobytes())
-        for told, end, length, bodies in zip(plain, ends, arrays["frames"], arrays["bodies"], strict=True):
+        for reported, end, length, bodies in zip(plain, ends, arrays["frames"], arrays["bodies"], strict=True):
             span = slice(end - length, end)
-            told["setting"] = Setting(**told["setting"])
-            record = Record(**told, **{name: arrays[name][span] for name in _ARRAYS})
+            reported["setting"] = Setting(**reported["setting"])
+            record = Record(**reported, **{name: arrays[name][span] for name in _ARRAYS})
             yield Tape(record, bodies, arrays["joints"][span].astype(np.float64))

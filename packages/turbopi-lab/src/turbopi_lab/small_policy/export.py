@@ -17,7 +17,7 @@ from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi_lab.small_policy.episodes import HORIZON
 
 ASSET_ID = "turbopi/libero_spatial"
-# As openpi's own pi05_libero, it doesn't read the state: where the hand is, the pictures show
+# As openpi's own pi05_libero, it doesn't read the state: where the hand is, the images show
 CONFIG: PolicyConfig = dataclasses.replace(
     preset("pi05_tiny"), name="pi05_tiny", discrete_state_input=False, asset_id=ASSET_ID
 ).with_model(action_horizon=HORIZON)

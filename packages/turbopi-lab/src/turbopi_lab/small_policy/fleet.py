@@ -110,10 +110,10 @@ class Fleet(threading.Thread):
 
     def _serve(self, log: Any) -> None:
         live = list(self._pipes)
-        asked: list[tuple[Any, np.ndarray, int, np.ndarray]] = []
+        requested: list[tuple[Any, np.ndarray, int, np.ndarray]] = []
         since = 0.0
         while not self.stopping and live:
-            ready: list[Any] = connection.wait(live, timeout=0.002 if asked else 0.1)
+            ready: list[Any] = connection.wait(live, timeout=0.002 if requested else 0.1)
             for pipe in ready:
                 try:
                     message = pipe.recv()
@@ -124,19 +124,19 @@ class Fleet(threading.Thread):
                     self.counts["lost workers"] += 1
                     continue
                 if message[0] == "look":
-                    since = since if asked else time.monotonic()
-                    asked.append((pipe, *message[1:]))
+                    since = since if requested else time.monotonic()
+                    requested.append((pipe, *message[1:]))
                 elif message[0] == "ready":
                     self.ready += 1
-            full = len(asked) >= self.actor.rows
-            if asked and (full or time.monotonic() - since > _GATHER_S):
-                self._answer(asked[: self.actor.rows])
-                asked = asked[self.actor.rows :]
+            full = len(requested) >= self.actor.rows
+            if requested and (full or time.monotonic() - since > _GATHER_S):
+                self._answer(requested[: self.actor.rows])
+                requested = requested[self.actor.rows :]
 
-    def _answer(self, asked: list[tuple[Any, np.ndarray, int, np.ndarray]]) -> None:
-        pipes, pictures, prompts, held = zip(*asked, strict=True)
+    def _answer(self, requested: list[tuple[Any, np.ndarray, int, np.ndarray]]) -> None:
+        pipes, camera_images, prompts, held = zip(*requested, strict=True)
         with self._weights_lock:
-            chunks = self.actor.chunks(self.scale, np.stack(pictures), list(prompts), held)
+            chunks = self.actor.chunks(self.scale, np.stack(camera_images), list(prompts), held)
         for pipe, chunk in zip(pipes, chunks, strict=True):
             try:
                 pipe.send(("chunk", chunk))
@@ -146,8 +146,8 @@ class Fleet(threading.Thread):
     def _take(self, record: Record, payload: bytes, log: Any) -> None:
         n = len(record.chunks)
         if n:
-            pictures = np.frombuffer(bytearray(payload), np.uint8).reshape(n, 2, IMAGE_PX, IMAGE_PX, 3)
-            self.counts[f"{record.kind} frames"] += self.memory.add(record, pictures)
+            camera_images = np.frombuffer(bytearray(payload), np.uint8).reshape(n, 2, IMAGE_PX, IMAGE_PX, 3)
+            self.counts[f"{record.kind} frames"] += self.memory.add(record, camera_images)
         self.counts[record.kind] += 1
         self.counts[f"{record.kind} solved"] += record.success
         if record.kind == "trial":

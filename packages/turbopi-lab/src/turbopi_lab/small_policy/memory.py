@@ -19,10 +19,10 @@ LEARNER_WEIGHT = 1.5  # of frames that the learner led to
 
 @dataclass
 class Batch:
-    """pictures uint8[B, 2, 224, 224, 3], chunks, executed float32[B, H, 7], leads, prompts, phases int64[B],
+    """images uint8[B, 2, 224, 224, 3], chunks, executed float32[B, H, 7], leads, prompts, phases int64[B],
     aux float32[B, AUX_DIM]: see episodes.Record."""
 
-    pictures: Tensor
+    camera_images: Tensor
     chunks: Tensor
     executed: Tensor
     leads: Tensor
@@ -36,7 +36,7 @@ class Memory:
 
     def __init__(self, capacity: int, device: torch.device) -> None:
         self.capacity, self.device, self.count = capacity, device, 0
-        self.pictures = torch.empty(capacity, 2, IMAGE_PX, IMAGE_PX, 3, dtype=torch.uint8, device=device)
+        self.camera_images = torch.empty(capacity, 2, IMAGE_PX, IMAGE_PX, 3, dtype=torch.uint8, device=device)
         self.chunks = torch.empty(capacity, HORIZON, 7, device=device)
         self.executed = torch.empty(capacity, HORIZON, 7, device=device)
         self.leads = torch.empty(capacity, dtype=torch.int64, device=device)
@@ -47,7 +47,7 @@ class Memory:
         self._stream: Any = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
         self._lock = threading.Lock()
 
-    def add(self, record: Record, pictures: np.ndarray) -> int:
+    def add(self, record: Record, camera_images: np.ndarray) -> int:
         """Returns how many frames there was room for."""
         start = self.count
         n = min(len(record.chunks), self.capacity - start)
@@ -55,7 +55,7 @@ class Memory:
             return 0
         with torch.cuda.stream(self._stream):
             span = slice(start, start + n)
-            self.pictures[span] = torch.from_numpy(pictures[:n]).to(self.device)
+            self.camera_images[span] = torch.from_numpy(camera_images[:n]).to(self.device)
             self.chunks[span] = torch.from_numpy(record.chunks[:n]).to(self.device)
             self.executed[span] = torch.from_numpy(record.executed[:n]).to(self.device)
             self.leads[span] = torch.from_numpy(record.leads[:n]).to(self.device)
@@ -80,7 +80,7 @@ class Memory:
 
     def batch(self, indices: Tensor) -> Batch:
         return Batch(
-            self.pictures[indices],
+            self.camera_images[indices],
             self.chunks[indices],
             self.executed[indices],
             self.leads[indices],

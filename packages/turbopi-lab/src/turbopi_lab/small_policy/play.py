@@ -1,7 +1,7 @@
-"""Episodes for later: played on any machine, without a GPU, and kept without pictures.
+"""Episodes for later: played on any machine, without a GPU, and kept without images.
 
 Most of the time of collecting goes into the simulator's physics, which need no GPU. So processes can play for hours on
-CPUs, and `train --tapes` draws the pictures, several hundred a second, on the machine that trains.
+CPUs, and `train --tapes` draws the images, several hundred a second, on the machine that trains.
 """
 
 import time
@@ -32,8 +32,8 @@ def learner_of(folder: Path) -> Learner:
     actor = Actor(CONFIG.model, 1, *prompt_table(), device)
     actor.take(checkpoint.load(device, "f32").state)
 
-    def ask(pictures: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray:
-        return actor.chunks(scale, pictures[None], [prompt], [held])[0]
+    def ask(camera_images: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray:
+        return actor.chunks(scale, camera_images[None], [prompt], [held])[0]
 
     return ask
 

@@ -3,7 +3,7 @@
     python -m turbopi_lab.small_policy post --out work/one_way --ways 1
     python -m turbopi_lab.small_policy post --out work/two_ways --ways 2
 
-They begin with the shipped chase policy's weights, which know what the pictures show. The expert passes the post on one
+They begin with the shipped chase policy's weights, which know what the images show. The expert passes the post on one
 side, always the same, or on one drawn for each episode. Everything else is equal: the model and its size (the chase's),
 the number of frames, the seed, the training. Seven minutes each on a CPU core.
 """

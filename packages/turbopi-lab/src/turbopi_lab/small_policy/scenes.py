@@ -63,14 +63,14 @@ class Setting:
 
 
 class PracticeScene(LiberoEnvironment):
-    """The evaluation's own environment, so that pictures are the evaluation's; resets keep the compiled scene."""
+    """The evaluation's own environment, so that images are the evaluation's; resets keep the compiled scene."""
 
     def __init__(self, scene: int) -> None:
         super().__init__(SUITE, scene, SimSettings())
         self.domain.hard_reset = False  # fixtures are placed by every reset all the same
 
     def begin(self, setting: Setting) -> None:
-        """As `reset`, with the movable objects somewhat elsewhere if the setting says so. Draws the pictures."""
+        """As `reset`, with the movable objects somewhat elsewhere if the setting says so. Draws the images."""
         assert setting.scene == self.task
         if setting.moved_seed is None:
             self.reset(setting.initial_state)
@@ -89,7 +89,7 @@ class PracticeScene(LiberoEnvironment):
         """Whether the bowl that is asked for is on the plate, as LIBERO's own predicate has it."""
         return bool(self.domain._eval_predicate(("on", setting.bowl, PLATE)))
 
-    # What a picture shows: bodies of the scene, which resets place, and joints, which move
+    # What an image shows: bodies of the scene, which resets place, and joints, which move
 
     def bodies(self) -> np.ndarray:
         """float64[bodies, 7]: positions and quaternions within their parents."""

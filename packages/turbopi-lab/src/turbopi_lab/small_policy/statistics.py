@@ -1,4 +1,4 @@
-"""Statistics to normalise with, from demonstrations that are played without pictures."""
+"""Statistics to normalise with, from demonstrations that are played without images."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -77,11 +77,11 @@ class Settings:
     compile: bool = True
     resume: bool = False
     start: Path | None = None  # a checkpoint whose weights to start from, instead of fresh ones
-    tapes: Path | None = None  # a folder of episodes that were played before, whose pictures are drawn at first
+    tapes: Path | None = None  # a folder of episodes that were played before, whose images are drawn at first
     delayed: float = 0.5  # share of DAgger episodes in which the learner's chunks come late; with max_delay
     max_delay: int = 0  # control steps of delay that are simulated, for real-time execution; 0: none
     device: str = "cuda"
-    draw_gpus: str = ""  # numbers of the GPUs that draw pictures, as 1,2: beside the one that learns, if there are any
+    draw_gpus: str = ""  # numbers of the GPUs that draw images, as 1,2: beside the one that learns, if there are any
 
 
 @dataclass
@@ -159,7 +159,7 @@ class Trainer:
         return {**{name: loss.detach() for name, loss in losses.items()}, "gradient": norm.detach()}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        pictures = augment(batch.pictures)
+        camera_images = augment(batch.camera_images)
         tokens, mask = self.tokens[batch.prompts], self.token_mask[batch.prompts]
         repeats, most = self.settings.repeats, self.settings.max_delay
         actions = self.normalized(batch.chunks).repeat_interleave(repeats, 0)
@@ -171,7 +171,7 @@ class Trainer:
             actions = torch.where(held[..., None], executed, actions)
         x = mixed(actions, noise, t, held)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            predicted, hidden = velocity(self.model, pictures, tokens, mask, x, t, self.regions, held)
+            predicted, hidden = velocity(self.model, camera_images, tokens, mask, x, t, self.regions, held)
         values, logits = self.guide(hidden, mask)
         return {
             "flow": flow_loss(predicted, noise - actions, self._weights, held),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are imported when they are asked for
     "steps": "how few denoising steps are enough, and with which solver",
     "distillation": "one denoising step by distillation",
-    "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
+    "kv_reuse": "keys and values of old images, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
     "pipelining": "the next observation encoded beside this one's denoising",
     "steps_libero": "steps on LIBERO (any checkpoint for it; else the small policy)",

@@ -69,13 +69,13 @@ def run(setup: Setup) -> Report:
     by_backend = [[one.worst_relative or 0.0 for one in found if one.observations == group] for group in groups]
     places = [float(number) for number in range(len(BACKENDS))]
     series = [Series(group, places, errors) for group, errors in zip(groups, by_backend, strict=True)]
-    told = ", ".join(f"{number} {name}" for number, name in enumerate(BACKENDS))
+    reported = ", ".join(f"{number} {name}" for number, name in enumerate(BACKENDS))
     return setup.report(
         STUDY,
         method=f"{exact.config.name}, {setup.steps} steps. The worst observation of each group, noise by its number.",
         controls=[Control("The reference has no error.", itself.worst_relative == 0, f"{itself.worst_relative}.")],
         tables=[Grid("Errors", ["backend", "observations", "count", "worst cosine", "worst relative error"], rows)],
-        plots=[Plot("actions", [Panel("Worst error", told, "relative error", series, log_y=True)])],
+        plots=[Plot("actions", [Panel("Worst error", reported, "relative error", series, log_y=True)])],
         verdict="; ".join(f"{o.backend} on {o.observations}: {significant(o.worst_relative)}" for o in found) + ".",
         would_change="A checkpoint with larger outliers.",
         not_run=["In closed loop: `turbopi compare` does that."],

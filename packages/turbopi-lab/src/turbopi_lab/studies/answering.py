@@ -21,7 +21,7 @@ Key = tuple[int, int]  # of an episode: task, initial state
 
 
 @dataclass
-class Asked:
+class Requested:
     """A batch of requests, on the model's device. numbers: of each episode's call, from 0"""
 
     observation: Observation
@@ -31,7 +31,7 @@ class Asked:
     numbers: Sequence[int]
 
 
-Answering = Callable[[Asked], Tensor]  # -> chunks float32[B, H, A], normalised
+Answering = Callable[[Requested], Tensor]  # -> chunks float32[B, H, A], normalised
 
 
 class AnsweringPolicy(LocalPolicy):
@@ -65,5 +65,5 @@ class AnsweringPolicy(LocalPolicy):
     ) -> Sample:
         assert len(self._current) == len(noise), "a call of the model for each call of the policy"
         episodes, numbers = zip(*self._current, strict=True)
-        asked = Asked(observation.to(self._device), noise.to(self._device), num_steps, episodes, numbers)
-        return Sample(self._answer(asked).cpu(), {})
+        requested = Requested(observation.to(self._device), noise.to(self._device), num_steps, episodes, numbers)
+        return Sample(self._answer(requested).cpu(), {})

@@ -1,6 +1,6 @@
 """FP8's certificates at full size, without a checkpoint: `python -m turbopi_lab.studies.certificates --out DIR`.
 
-For each kind of weights (studies/weights.py): a calibration on varied LIBERO pictures, then `verify` in both tiers on
+For each kind of weights (studies/weights.py): a calibration on varied LIBERO images, then `verify` in both tiers on
 other ones, each cut down to what fits in a table.
 """
 
@@ -57,9 +57,9 @@ def varied(seed: int, count: int) -> Iterator[dict[str, np.ndarray | str]]:
         }
 
 
-def _varied(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _varied(camera_image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     shift = tuple(rng.integers(-_MOST_SHIFT, _MOST_SHIFT + 1, 2))
-    return np.clip(np.roll(picture, shift, (0, 1)) * rng.uniform(0.7, 1.3), 0, 255).astype(np.uint8)
+    return np.clip(np.roll(camera_image, shift, (0, 1)) * rng.uniform(0.7, 1.3), 0, 255).astype(np.uint8)
 
 
 def _record(folder: Path, seed: int, count: int) -> Path:

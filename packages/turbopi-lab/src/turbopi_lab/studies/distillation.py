@@ -129,7 +129,7 @@ def _judge(
         for weights, policy in models.items():
             for steps in (STEPS, 1) if weights == TEACHER else (1,):
                 one = spread(policy, episodes, 16 if small else 64, steps)
-                spreads.append(structs.replace(one, policy=f"{name}, {weights}, {_told(steps)}"))
+                spreads.append(structs.replace(one, policy=f"{name}, {weights}, {_reported(steps)}"))
     pairs_matter = None
     if {"consistency", "shuffled"} <= models.keys():
         pairs_matter = found["shuffled", 1].against(found["consistency", 1]).document
@@ -142,7 +142,7 @@ def _steps(weights: str) -> tuple[int, ...]:
     return {TEACHER: (STEPS, 1), "consistency": (1, 2, STEPS)}.get(weights, (1,))
 
 
-def _told(steps: int) -> str:
+def _reported(steps: int) -> str:
     return "one step" if steps == 1 else f"{steps} steps"
 
 

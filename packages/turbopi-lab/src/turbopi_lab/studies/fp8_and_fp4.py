@@ -259,7 +259,7 @@ def run(setup: Setup) -> Report:
 
 
 def _problems(setup: Setup) -> dict[str, tuple[Pi0Model, list[Batch], list[Batch]]]:
-    """By weights: a model, what it is judged on, and others, which give the directions. On LIBERO pictures."""
+    """By weights: a model, what it is judged on, and others, which give the directions. On LIBERO images."""
     size = "pi05_libero" if setup.device.type == "cuda" else "pi05_tiny"
     checkpoints = {"small policy": open_checkpoint(shipped.SMALL_POLICY)}
     if not setup.small:
@@ -342,8 +342,8 @@ def verdict(found: Mapping[str, Mapping[str, FormatError]], successes: Sequence[
             f"{policy}: {'worse than float32: ' + ', '.join(worse) if worse else 'no format is worse than float32'}"
         )
     small = found["small policy"]
-    told = ", ".join(f"{name} {small[name].relative_rms:.3f}" for name in ("FP8", "W4A8", "NVFP4"))
-    return f"{'. '.join(said)}. Relative rms error of the small policy's actions: {told}."
+    reported = ", ".join(f"{name} {small[name].relative_rms:.3f}" for name in ("FP8", "W4A8", "NVFP4"))
+    return f"{'. '.join(said)}. Relative rms error of the small policy's actions: {reported}."
 
 
 def _error_table(found: Mapping[str, Mapping[str, FormatError]]) -> Grid:

@@ -17,13 +17,13 @@ from turbopi_lab.studies.fp8_and_fp4 import CLAIMED, WRONG, cases, in_four_bits
 from turbopi_lab.studies.simulated import STEPS, Given, Variant, Variants
 
 FORMATS = ("FP8", "NVFP4", "NVFP4, weights alone", "W4A8", "W4A8 (MXFP4)", WRONG)
-NOISES = 2  # of each picture that activations' scales come from
+NOISES = 2  # of each image that activations' scales come from
 
 
 @contextmanager
 def _open(given: Given, name: str) -> Iterator[PolicySource]:
     policy = given.policy()
-    seen = _pictures(policy, few=given.small)
+    seen = _images(policy, few=given.small)
     with cases(reference_model(policy.backend), [seen], [seen], STEPS)[name]():
         yield given.source(policy)
 
@@ -38,8 +38,8 @@ def _open_exact(given: Given) -> Iterator[PolicySource]:
         yield given.source(policy)
 
 
-def _pictures(policy: UnifiedPolicy, few: bool) -> Batch:
-    """LIBERO pictures that come with Turbo-Pi, all with the first one's prompt, as calibration needs it of a batch."""
+def _images(policy: UnifiedPolicy, few: bool) -> Batch:
+    """LIBERO images that come with Turbo-Pi, all with the first one's prompt, as calibration needs it of a batch."""
     given = shipped.observations(policy, shipped.load_frames()[: 1 if few else None])
     inputs = [policy.prepare(one | {"prompt": given[0]["prompt"]}) for one in given for _ in range(NOISES)]
     model, device = policy.config.model, policy.backend.device
@@ -59,7 +59,7 @@ STUDY = Variants(
     broken=WRONG,
     method=(
         "Every product of vision, prefix and expert whose sizes allow it, with operands rounded exactly as the format "
-        "holds them, float32 between; activations' scales for FP8 from LIBERO pictures that come with Turbo-Pi."
+        "holds them, float32 between; activations' scales for FP8 from LIBERO images that come with Turbo-Pi."
     ),
     would_change="Trained weights of full size, whose outliers are larger; a kernel, which sums in another order.",
     x_label="cell, in the table's order",

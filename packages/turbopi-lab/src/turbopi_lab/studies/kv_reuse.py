@@ -1,13 +1,13 @@
-"""Reuse of the prefix's keys and values while pictures look alike: how much work does it save, at what price?
+"""Reuse of the prefix's keys and values while images look alike: how much work does it save, at what price?
 
 The similarity is the cosine of the vision tower's tokens now and when they were last computed, so the tower runs in
 every call; only `every k-th call` saves it, too. What is reused, where the similarity is at least θ:
 
-    full         all keys and values, of pictures and text
+    full         all keys and values, of images and text
     per camera   a camera's tokens as they enter the language model, which runs over old and new ones
     per patch    keys and values of single image tokens, in all layers, as VLA-Cache does (Xu et al. 2025); text and
                  changed tokens are computed, and attend to old ones
-    every k      all keys and values in k − 1 of k calls, whatever the pictures show
+    every k      all keys and values in k − 1 of k calls, whatever the images show
 
 Vision alone, with text and state computed afresh, gives what `full` gives where neither text nor state changes: the
 policies here have one instruction and read no state.
@@ -191,7 +191,7 @@ class Reusing:
             stale = F.pad(old, (0, text))
             mixed = torch.where(stale[..., None], memory.embs, embedded.embs)
             return self.model.keys_values(EmbeddedPrefix(mixed, embedded.layout, embedded.lengths, embedded.state))
-        # the text's keys and values are old, too, where those of all pictures are: nothing is computed then
+        # the text's keys and values are old, too, where those of all images are: nothing is computed then
         stale = torch.cat((old, old.all(1, keepdim=True).expand(-1, text)), dim=1)
         k, v = keys_values(self.model, embedded, stale, memory)
         return KVCache(k, v, embedded.layout.mask, embedded.lengths, embedded.state)
@@ -205,7 +205,7 @@ class Reusing:
         keep: Tensor,
         before: Memory,
     ) -> None:
-        """What was reused stays as it was computed, so that pictures can't drift away unnoticed."""
+        """What was reused stays as it was computed, so that images can't drift away unnoticed."""
         stale = F.pad(keep, (0, embedded.embs.shape[1] - keep.shape[1]))[..., None]
         padded = embedded.layout.to_padded
         hidden = torch.where(keep[..., None], before.hidden, hidden)
@@ -260,18 +260,18 @@ def keys_values(model: Pi0Model, embedded: EmbeddedPrefix, stale: Tensor, memory
 def saved(reuse: Reuse, reused: float, whole: float, *, free: bool = False) -> dict[str, float]:
     """Shares of two stages' work that aren't done, for shares of tokens and of whole calls that are reused.
 
-    The tower runs for every picture, to compare it; `free`: it needn't, as if that were known without it.
+    The tower runs for every image, to compare it; `free`: it needn't, as if that were known without it.
     """
     prefix = reused if reuse.what == "patch" else whole
     if reuse.what == "every":
         return {"vision": whole, "prefix": prefix}
-    vision = reused if reuse.what == "camera" else whole  # a picture of which one patch has changed is embedded
+    vision = reused if reuse.what == "camera" else whole  # an image of which one patch has changed is embedded
     return {"vision": vision if free else 0.0, "prefix": prefix}
 
 
 def speed_ups(reuse: Reuse, reused: float, whole: float) -> tuple[float, float, float]:
     """Of Pi0.5 for LIBERO in full size, by arithmetic: by its operations, by the H200's times of its stages, and by
-    those if comparing pictures were free.
+    those if comparing images were free.
     """
     work = {name: float(stage.flops) for name, stage in stage_work(preset("pi05_libero").model, Job(), 2).items()}
 
@@ -310,8 +310,8 @@ def run(setup: Setup) -> Report:
         plots=[_plot(found)],
         verdict=verdict(found),
         would_change=(
-            "A task whose pictures stand still for long while the policy needs no answer; a policy that reads the "
-            "state, so that old pictures may contradict it; larger pictures of which most patches never change."
+            "A task whose images stand still for long while the policy needs no answer; a policy that reads the "
+            "state, so that old images may contradict it; larger images of which most patches never change."
         ),
         not_run=[
             "Vision alone with fresh state: none of these policies reads the state, so it equals full reuse.",
@@ -340,7 +340,7 @@ METHOD = (
     "the same episodes and noise in every cell. Image tokens are reused while their cosine to those that were last "
     "computed is at least θ: all together, camera by camera, or token by token. Speed-ups are arithmetic for "
     "pi05_libero (two cameras, 48 tokens, ten steps): by operations, by the measured times of the stages of `fused` on "
-    "an H200, and by those if the vision tower needn't run to compare pictures."
+    "an H200, and by those if the vision tower needn't run to compare images."
 )
 CLAIMED = (
     "θ = 0.985 is safe and gives 1.14 ×; beyond it success falls from 100 % to 36–57 %; vision and state must be "
@@ -375,8 +375,8 @@ def verdict(found: Sequence[ReuseCell]) -> str:
         good = [cell for cell in own if cell.verdict == "as good"]
         if good:
             best = max(good, key=lambda cell: _speed(cell)[1])
-            told = f"{best.rate.rate or 0:.1%}, {_speed(best)[1]:.2f} × by the stages' times"
-            text += f"; the fastest that is as good is {Reuse(best.reuse, best.value)} ({told})"
+            reported = f"{best.rate.rate or 0:.1%}, {_speed(best)[1]:.2f} × by the stages' times"
+            text += f"; the fastest that is as good is {Reuse(best.reuse, best.value)} ({reported})"
         said.append(text)
     return f"{'. '.join(said)}. “As good”: not worse by {100 * MARGIN:.0f} points, with 95 % confidence."
 
@@ -411,4 +411,4 @@ def _plot(found: Sequence[ReuseCell]) -> Plot:
     return Plot("kv_reuse", panels)
 
 
-STUDY = Study("kv_reuse", "Can the prefix's keys and values be reused while pictures look alike?", CLAIMED, run)
+STUDY = Study("kv_reuse", "Can the prefix's keys and values be reused while images look alike?", CLAIMED, run)

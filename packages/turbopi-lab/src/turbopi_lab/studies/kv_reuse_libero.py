@@ -12,13 +12,13 @@ from torch import Tensor
 from turbopi.backends.pytorch import reference_model
 from turbopi.evaluate.sources import PolicySource
 from turbopi.support.files import append_line, whole_lines
-from turbopi_lab.studies.answering import Asked
+from turbopi_lab.studies.answering import Requested
 from turbopi_lab.studies.kv_reuse import CLAIMED, NOTHING, Reuse, Reusing, speed_ups
 from turbopi_lab.studies.simulated import PLAIN, Given, Variant, Variants, open_plain
 
 FILE = "reused.jsonl"  # in a cell's folder: [task, initial state, call, share of image tokens that it reused]
 ANOTHERS = "every 2, of another episode"
-CELLS = (  # in two episodes of LIBERO cosines of two calls' pictures were from 0.86 to 0.94, half of them above 0.90
+CELLS = (  # in two episodes of LIBERO cosines of two calls' images were from 0.86 to 0.94, half of them above 0.90
     *(Reuse("full", 0.985), Reuse("full", 0.92), Reuse("full", 0.9), Reuse("full", 0.87)),
     *(Reuse("patch", 0.985), Reuse("patch", 0.95), Reuse("patch", 0.9), Reuse("every", 2)),
 )
@@ -29,10 +29,12 @@ def _open(given: Given, reuse: Reuse, roll: int = 0) -> Iterator[PolicySource]:
     policy = given.policy()
     reusing = Reusing(reference_model(policy.backend), reuse, roll, compare=False)
 
-    def answer(asked: Asked) -> Tensor:
+    def answer(requested: Requested) -> Tensor:
         reusing.shares.clear()
-        chunk = reusing.answer(asked.observation, asked.noise, asked.steps, asked.episodes, asked.numbers)
-        rows = zip(asked.episodes, asked.numbers, reusing.shares, strict=True)
+        chunk = reusing.answer(
+            requested.observation, requested.noise, requested.steps, requested.episodes, requested.numbers
+        )
+        rows = zip(requested.episodes, requested.numbers, reusing.shares, strict=True)
         lines = [json.dumps([*episode, number, share]) for episode, number, share in rows]
         append_line(given.folder / FILE, "\n".join(lines))
         return chunk
@@ -75,7 +77,7 @@ def _variant(reuse: Reuse) -> Variant:
 
 VARIANTS = Variants(
     name="kv_reuse_libero",
-    question="Can the prefix's keys and values be reused on LIBERO while pictures look alike?",
+    question="Can the prefix's keys and values be reused on LIBERO while images look alike?",
     claimed=CLAIMED,
     cells=[*map(_variant, CELLS), Variant(ANOTHERS, partial(_open, reuse=Reuse("every", 2), roll=1))],
     few=["full 0.9", "every 2"],
@@ -87,7 +89,7 @@ VARIANTS = Variants(
         "token by token; every 2: all keys and values in every second call. Speed-ups are arithmetic, by the times of "
         "the stages of `fused` on an H200."
     ),
-    would_change="Pictures that stand still for long while the policy needs no answer; a policy that reads the state.",
+    would_change="Images that stand still for long while the policy needs no answer; a policy that reads the state.",
     x_label="image tokens reused, %",
     plain=Variant(PLAIN, open_plain, x=0),
     measured=_measured,

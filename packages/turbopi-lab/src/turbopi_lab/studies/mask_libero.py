@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.backends.pytorch import reference_model
 from turbopi.evaluate.sources import PolicySource
-from turbopi_lab.studies.answering import Asked
+from turbopi_lab.studies.answering import Requested
 from turbopi_lab.studies.mask import CACHES, CLAIMED, cache_of
 from turbopi_lab.studies.simulated import Given, Variant, Variants
 
@@ -18,8 +18,8 @@ def _open(given: Given, name: str) -> Iterator[PolicySource]:
     policy = given.policy()
     model = reference_model(policy.backend)
 
-    def answer(asked: Asked) -> Tensor:
-        return model.denoise(cache_of(model, asked.observation, name), asked.noise, asked.steps)
+    def answer(requested: Requested) -> Tensor:
+        return model.denoise(cache_of(model, requested.observation, name), requested.noise, requested.steps)
 
     yield given.answered(policy, answer)
 

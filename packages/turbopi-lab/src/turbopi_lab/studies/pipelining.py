@@ -171,10 +171,10 @@ def run(setup: Setup) -> Report:
             played, ages = play_late(policy, episodes, actor, timing)
             serial = serial or played
             steady = ages[timing.latency + timing.period :]
-            told = float(np.mean(steady)), max(steady)
+            reported = float(np.mean(steady)), max(steady)
             rates = played.rate.document, played.against(serial).document
-            cells.append(TimingCell(stage, timing.how, timing.latency, timing.period, *told, *rates))
-            setup.tell(f"{stage} + {stage} steps, {timing.how}: {played.rate}, age {told[0]:.2f}")
+            cells.append(TimingCell(stage, timing.how, timing.latency, timing.period, *reported, *rates))
+            setup.tell(f"{stage} + {stage} steps, {timing.how}: {played.rate}, age {reported[0]:.2f}")
     found = _measured(setup) if setup.device.type == "cuda" else None
     return setup.report(
         STUDY,
@@ -252,9 +252,9 @@ def verdict(cells: Sequence[TimingCell]) -> str:
         if cell.latency == cell.period:
             continue
         low, high = cell.against_serial.difference95
-        told = "better" if low > 0 else "worse" if high < 0 else "no different"
+        reported = "better" if low > 0 else "worse" if high < 0 else "no different"
         stages = f"{cell.stage_steps} + {cell.stage_steps} steps"
-        said.append(f"{stages} {cell.how}: {paired_cell(cell.against_serial)}, {told}")
+        said.append(f"{stages} {cell.how}: {paired_cell(cell.against_serial)}, {reported}")
     latency, rate = (MEASURED["in flight"][i] / MEASURED["one at a time"][i] for i in (0, 1))
     return (
         f"Success against one at a time, points: {'; '.join(said)}. On one H200, `tensorrt_pipelined` gives {rate:.2f} "

@@ -24,7 +24,7 @@ from turbopi_lab.studies.study import Setup
 
 EXACT = 100  # intervals of the midpoint method: the solution that errors are measured against
 SMALL_EXACT = 10
-NOISES = 2  # of each LIBERO picture
+NOISES = 2  # of each LIBERO image
 
 
 class ErrorCell(Struct, frozen=True):
@@ -100,9 +100,9 @@ def errors(name: str, problem: Problem, learned: Learned, small: bool) -> list[E
 def libero_batches(
     checkpoint: Checkpoint, device: torch.device, small: bool, *, one_prompt: bool = False
 ) -> tuple[Pi0Model, Batch, Batch]:
-    """The model in float32, and two batches on LIBERO pictures: to learn on, and others to judge on.
+    """The model in float32, and two batches on LIBERO images: to learn on, and others to judge on.
 
-    `one_prompt`: all pictures with the first one's prompt and state, as calibration needs it of a batch.
+    `one_prompt`: all images with the first one's prompt and state, as calibration needs it of a batch.
     """
     config = checkpoint.config
     tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=config.model.vocab_size)

@@ -60,12 +60,12 @@ class ToyPolicy:
 
     def observe(self, world: Chase) -> Observation:
         """What all episodes see now."""
-        pictures = torch.from_numpy(world.draw(self.config.model.vision.image_size))
-        batch, cameras = pictures.shape[:2]
+        camera_images = torch.from_numpy(world.draw(self.config.model.vision.image_size))
+        batch, cameras = camera_images.shape[:2]
         tokens = self.tokens.expand(batch, -1)
         there = torch.ones(batch, cameras, dtype=torch.bool)
         state = torch.zeros(batch, self.config.model.action_dim)  # none of these policies reads it
-        return Observation(pictures, there, tokens, torch.ones_like(tokens, dtype=torch.bool), state)
+        return Observation(camera_images, there, tokens, torch.ones_like(tokens, dtype=torch.bool), state)
 
     def noise(self, episodes: Sequence[int], call: int) -> Tensor:
         """float32[N, H, action_dim] of every episode's call."""

@@ -193,14 +193,14 @@ class Variants:
             _check_pair(plain, results)
             solved[cell.name] = _solved(results)
             ran_on.setdefault(str(results.policy.about.get("device_name")), []).append(cell.name)
-            told = {} if self.measured is None else self.measured(cell.name, place)
-            cells.append(_cell(cell.name, solved[PLAIN], solved[cell.name], told))
+            reported = {} if self.measured is None else self.measured(cell.name, place)
+            cells.append(_cell(cell.name, solved[PLAIN], solved[cell.name], reported))
         count = len(solved[PLAIN])
         return setup.report(
             self.study,
             method=(
                 f"`turbopi eval {plain.protocol['simulator']}`'s episodes: {plain.suite}, {count} of them, the same "
-                f"ones with the same noise in every cell, run on {_devices_told(ran_on)}. {self.method} "
+                f"ones with the same noise in every cell, run on {_devices_reported(ran_on)}. {self.method} "
                 f"Differences are against the plain policy: the float32 reference, ten Euler steps."
             ),
             controls=self.controls(folder, cells, setup.small),
@@ -359,8 +359,8 @@ def _check_pair(plain: Results, results: Results) -> None:
 
     def decisive(of: Results) -> dict[str, object]:
         names = ("weights", "config", "backend", "precision", "robot")
-        told: dict[str, object] = {f"policy's {name}": of.policy.identity.get(name) for name in names}
-        return told | {f"protocol's {name}": value for name, value in of.protocol.items()}
+        reported: dict[str, object] = {f"policy's {name}": of.policy.identity.get(name) for name in names}
+        return reported | {f"protocol's {name}": value for name, value in of.protocol.items()}
 
     if apart := sorted(plain.planned ^ results.planned):
         owner = plain if apart[0] in plain.planned else results
@@ -392,7 +392,7 @@ def _cell(
     return SimulatorCell(way, Rate(sum(solved.values()), len(solved)).document, paired.document, dict(measured))
 
 
-def _devices_told(ran_on: Mapping[str, Sequence[str]]) -> str:
+def _devices_reported(ran_on: Mapping[str, Sequence[str]]) -> str:
     """Of cells by device; where there are several, which cells each has run."""
     if len(ran_on) == 1:
         return next(iter(ran_on))

@@ -25,8 +25,8 @@ def integration(solver: Solver, times: Times, evaluations: int) -> Integration:
 
 def solve(model: Pi0Model, cache: KVCache, noise: Tensor, solver: Solver, times: Times, evaluations: int) -> Tensor:
     """Actions float32[B, H, action_dim] from noise, which is x at times[0]."""
-    asked = Conditioning(integration=integration(solver, times, evaluations))
-    return model.denoise(cache, noise, evaluations, conditioning=asked)
+    requested = Conditioning(integration=integration(solver, times, evaluations))
+    return model.denoise(cache, noise, evaluations, conditioning=requested)
 
 
 def begins(grid: GridName, count: int) -> list[float]:

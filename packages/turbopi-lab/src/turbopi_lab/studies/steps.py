@@ -233,22 +233,24 @@ def _controls(policy: ToyPolicy, spreads: Sequence[Spread], halved: Mapping[str,
     worst = max(value for name, value in halved.items() if name != RANDOM)
     bound = 0.3 if small else 0.01  # ten steps in the small form
     random = f", with random weights {halved[RANDOM]:.1e}" if RANDOM in halved else ""
-    told = f"{worst:.1e} of the actions{random}."
+    reported = f"{worst:.1e} of the actions{random}."
     controls = [
         Control("Ten Euler steps here are `Pi0Model.denoise`'s.", off < 1e-5, f"Largest difference {off:.1e}."),
         Control("A warm start at t = 1 is the plain run, bit for bit.", warm_from_noise_is_plain(policy), ""),
-        Control("Half as many steps give the exact solution, too, of every trained policy.", worst < bound, told),
+        Control("Half as many steps give the exact solution, too, of every trained policy.", worst < bound, reported),
     ]
     by_name = {one.policy: one for one in spreads}
     if {"one_way", "two_ways"} <= by_name.keys():
         one, two = by_name["one_way"], by_name["two_ways"]
-        told = f"{one.bimodality:.2f} and {two.bimodality:.2f}, rarer side {one.minority:.3f} and {two.minority:.3f}."
+        reported = (
+            f"{one.bimodality:.2f} and {two.bimodality:.2f}, rarer side {one.minority:.3f} and {two.minority:.3f}."
+        )
         controls.append(
             Control(
                 "Actions of two_ways are bimodal, those of one_way aren't "
                 f"(Sarle's coefficient; uniform {UNIFORM:.2f}).",
                 one.bimodality < UNIFORM < two.bimodality and one.minority < 0.05 < two.minority,
-                told,
+                reported,
             )
         )
     return controls

@@ -38,7 +38,7 @@ def tell_on_stderr(line: str) -> None:
 
 
 def _packaged(policy: UnifiedPolicy) -> tuple[list[dict[str, object]], str]:
-    return shipped.observations(policy, shipped.load_frames()), "LIBERO pictures that come with Turbo-Pi"
+    return shipped.observations(policy, shipped.load_frames()), "LIBERO images that come with Turbo-Pi"
 
 
 @dataclass(frozen=True, kw_only=True)

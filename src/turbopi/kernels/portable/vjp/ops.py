@@ -32,6 +32,6 @@ FEW_TOKENS = BackwardOps(
 ORIGIN = f"Triton for up to {MOST_TOKENS} tokens, else cuBLAS and Triton"
 
 
-def way_back(expert: GemmaConfig, tokens: int, masked: bool = False) -> BackwardOps:
+def backward_form(expert: GemmaConfig, tokens: int, masked: bool = False) -> BackwardOps:
     """masked: keys are hidden from some tokens, as of several observations together."""
     return FEW_TOKENS if takes(expert, tokens) and not masked else BETWEEN_PRODUCTS

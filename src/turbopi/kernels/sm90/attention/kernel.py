@@ -122,7 +122,7 @@ def packed_attention(
 def vision_attention(
     qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: AttentionTile | None = None
 ) -> Tensor:
-    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
+    """Self-attention inside each image: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
     bfloat16, contiguous. With `inverse` the result leaves as E4M3.
     """
@@ -160,9 +160,9 @@ def _launch(
     inverse: float | None,
     segments: Tensor | None = None,
 ) -> None:
-    """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of pictures and heads.
+    """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of images and heads.
 
-    rows and keys: of one picture. `segments` int32[blocks, 4]: of packed rows.
+    rows and keys: of one image. `segments` int32[blocks, 4]: of packed rows.
     """
     packed = segments is not None
     count = out.shape[-1] // tile.dim if length is None and not packed else 1  # query heads beside each other

@@ -259,8 +259,8 @@ def megahertz(cycles: int, nanoseconds: int) -> float | None:
 def stuck(words: list[int]) -> str | None:
     """What the blocks' words of `watch` (watch.cu) say, or None: none has said anything."""
     waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
-    told = tuple(WAITS.values())
-    where = ", ".join(f"layer {layer} for {told[what]}" for layer, what in waits[:8])
+    reported = tuple(WAITS.values())
+    where = ", ".join(f"layer {layer} for {reported[what]}" for layer, what in waits[:8])
     return f"blocks of the denoising kernel waited for seconds (counted over all steps): {where}" if waits else None
 
 

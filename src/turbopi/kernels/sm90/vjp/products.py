@@ -18,7 +18,7 @@ from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.vjp import products as portable
 from turbopi.kernels.portable.vjp import tiles
 from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
-from turbopi.kernels.portable.vjp.ops import way_back as portable_way_back
+from turbopi.kernels.portable.vjp.ops import backward_form as portable_backward
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
@@ -141,7 +141,7 @@ ORIGIN: Final = (
 ACROSS = replace(FEW_TOKENS, down_vjp=down_vjp, out_vjp=out_vjp, gate_up_vjp=gate_up_vjp, origin="CUDA and Triton")
 
 
-def way_back(expert: GemmaConfig, tokens: int, masked: bool = False) -> BackwardOps:
+def backward_form(expert: GemmaConfig, tokens: int, masked: bool = False) -> BackwardOps:
     """See `portable.vjp.ops.way_back`."""
-    found = portable_way_back(expert, tokens, masked)
+    found = portable_backward(expert, tokens, masked)
     return ACROSS if found is FEW_TOKENS and tokens <= MOST_TOKENS else found

@@ -27,7 +27,7 @@ class Counter:
         self.steps = 0
 
     def observation(self) -> dict[str, Any]:
-        return {"picture": self.draw()[0]}
+        return {"image": self.draw()[0]}
 
     def step(self, action: np.ndarray, look: bool) -> bool:
         self.steps += 1
@@ -40,7 +40,7 @@ class Counter:
         pass
 
 
-def film(way: str, delay: int, *, steps: int, smooth: bool = False, bad_at: int = -1) -> list[Frame]:
+def on_frame(way: str, delay: int, *, steps: int, smooth: bool = False, bad_at: int = -1) -> list[Frame]:
     """Chunks whose row i is 100 * (when it was asked) + i, asked for every 4 actions."""
 
     def ask(step: int, observation: dict[str, Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,11 +51,11 @@ def film(way: str, delay: int, *, steps: int, smooth: bool = False, bad_at: int 
 
     frames: list[Frame] = []
     execution = Execution(way, 4, delay, lambda last: np.full(7, -1.0))
-    keys = ("picture",)
+    keys = ("image",)
     run_episode(
-        Counter(), Job(TASK, 0), ask, execution, max_steps=steps, image_keys=keys, film=frames.append, smooth=smooth
+        Counter(), Job(TASK, 0), ask, execution, max_steps=steps, image_keys=keys, on_frame=frames.append, smooth=smooth
     )
-    assert all(frame.pictures[0][0, 0, 0] == frame.step for frame in frames)
+    assert all(frame.camera_images[0][0, 0, 0] == frame.step for frame in frames)
     return frames
 
 
@@ -65,14 +65,14 @@ def seen(frames: list[Frame]) -> list[tuple[int, int, int, int, int]]:
 
 
 def test_without_a_delay_each_look_shows_the_chunk_that_it_asked_for() -> None:
-    frames = film("async", 0, steps=10)
+    frames = on_frame("async", 0, steps=10)
     assert seen(frames) == [(0, 0, 0, 4, 0), (4, 4, 0, 4, 0), (8, 8, 0, 2, 0), (10, 8, 0, 2, 2)]
     assert not any(frame.note or len(frame.before) for frame in frames)
 
 
 @pytest.mark.parametrize("way", ["async", "rtc", "rtc_trained"])
 def test_a_chunk_is_shown_from_the_step_at_which_it_takes_over(way: str) -> None:
-    frames = film(way, 2, steps=12)
+    frames = on_frame(way, 2, steps=12)
     assert seen(frames) == [
         *((0, 0, 0, 6, 0), (4, 0, 0, 6, 4)),  # looks: the chunk that runs is the one that was asked for before
         *((6, 4, 2, 6, 2), (8, 4, 2, 6, 4)),
@@ -84,19 +84,19 @@ def test_a_chunk_is_shown_from_the_step_at_which_it_takes_over(way: str) -> None
 
 
 def test_a_robot_that_stands_still_is_said_to() -> None:
-    frames = film("sync", 2, steps=8)
+    frames = on_frame("sync", 2, steps=8)
     assert seen(frames) == [(0, 0, 0, 4, 0), (4, 0, 0, 4, 4), (6, 4, 0, 2, 0), (8, 4, 0, 2, 2)]
     assert [frame.note for frame in frames] == ["", "stands still: the policy computes", "", ""]
 
 
 def test_a_smooth_film_has_every_step_once() -> None:
-    frames = film("async", 2, steps=9, smooth=True)
+    frames = on_frame("async", 2, steps=9, smooth=True)
     assert [frame.step for frame in frames] == list(range(10))
     assert [frame.done for frame in frames] == [0, 1, 2, 3, 4, 5, 2, 3, 4, 5]
 
 
 def test_a_chunk_that_cannot_be_carried_out_is_shown_at_the_end() -> None:
-    frames = film("async", 0, steps=10, bad_at=4)
+    frames = on_frame("async", 0, steps=10, bad_at=4)
     assert [frame.step for frame in frames] == [0, 4]
     assert np.isnan(frames[1].chunk[3]).all() and (frames[1].planned, frames[1].done) == (0, 0)
 
@@ -108,7 +108,7 @@ def test_a_film_of_no_actions_at_all_can_be_drawn() -> None:
         raise NoActions("none")
 
     run_episode(
-        Counter(), Job(TASK, 0), ask, Execution("sync", 4), max_steps=5, image_keys=("picture",), film=frames.append
+        Counter(), Job(TASK, 0), ask, Execution("sync", 4), max_steps=5, image_keys=("image",), on_frame=frames.append
     )
     assert [frame.step for frame in frames] == [0]
     assert draw_frame(frames[0], "x", chunk_groups("libero", 1), "aborted").ndim == 3
@@ -119,17 +119,17 @@ def test_the_delay_is_drawn_apart_from_what_is_carried_out() -> None:
         drawn = draw_frame(frame, "x", GROUPS, None, delayed=True)
         return int((drawn == color).all(axis=2).sum())
 
-    picture, chunk, before = [np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((12, 7)), np.ones((2, 7))
-    plain, delayed = Frame(6, picture, chunk, 6, 2), Frame(6, picture, chunk, 6, 2, 2, before)
+    camera_image, chunk, before = [np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((12, 7)), np.ones((2, 7))
+    plain, delayed = Frame(6, camera_image, chunk, 6, 2), Frame(6, camera_image, chunk, 6, 2, 2, before)
     assert colored(plain, MEANWHILE) == 0 < colored(delayed, MEANWHILE)
     assert 0 < colored(delayed, CARRIED_OUT) < colored(plain, CARRIED_OUT)
-    moved = Frame(6, picture, chunk, 6, 2, 2, -before)
+    moved = Frame(6, camera_image, chunk, 6, 2, 2, -before)
     assert (draw_frame(delayed, "x", GROUPS, None) != draw_frame(moved, "x", GROUPS, None)).any()
 
 
 def test_frames_last_until_the_next_one(tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v2", reason="pip install 'imageio[ffmpeg]'")
-    frames = film("async", 2, steps=12)
+    frames = on_frame("async", 2, steps=12)
     assert lengths(frames) == [4, 2, 2, 2, 2, 2]
     write_video(tmp_path / "a.mp4", frames, "x", "success", "libero", 20.0)
     with imageio.get_reader(tmp_path / "a.mp4") as reader:
