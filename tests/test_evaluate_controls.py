@@ -51,7 +51,7 @@ def test_the_prompt_is_the_next_tasks_and_the_last_tasks_is_the_first() -> None:
 
 def test_the_pictures_are_the_newest_of_the_next_task_that_was_seen() -> None:
     source = Recorder()
-    controlled = Controlled(source, "images", TASKS, KEYS)
+    controlled = Controlled(source, "pictures", TASKS, KEYS)
     controlled.infer([observation(0, 10)], [0])
     controlled.infer([observation(2, 30)], [0])
     controlled.infer([observation(2, 31), observation(1, 20), observation(0, 11)], [0, 1, 2])
@@ -75,12 +75,12 @@ def test_the_policy_behind_a_control_is_warmed_up() -> None:
 def test_an_unknown_prompt_passes_as_it_is() -> None:
     source = Recorder()
     example = observation(0, 5) | {"prompt": "something else"}
-    Controlled(source, "images", TASKS, KEYS).infer([example], [0])
+    Controlled(source, "pictures", TASKS, KEYS).infer([example], [0])
     assert source.requested[0]["prompt"] == "something else"
     assert int(source.requested[0][KEYS[0]].max()) == 5
 
 
-@pytest.mark.parametrize(("control", "tasks"), [("prompt", TASKS[:1]), ("images", TASKS[:1] * 5), ("noise", TASKS)])
+@pytest.mark.parametrize(("control", "tasks"), [("prompt", TASKS[:1]), ("pictures", TASKS[:1] * 5), ("noise", TASKS)])
 def test_a_control_that_is_impossible_is_refused(control: Any, tasks: list[str]) -> None:
     with pytest.raises(ConfigError, match="control"):
         Controlled(Recorder(), control, tasks, KEYS)

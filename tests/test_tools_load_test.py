@@ -264,7 +264,7 @@ class Counting(FakePolicy):
         return super().infer(obs)
 
 
-QUICK = {"seconds": 1.0, "warmup": 0.0, "drain_s": 100.0, "robot": "libero", "images": (8, 6)}
+QUICK = {"seconds": 1.0, "warmup": 0.0, "drain_s": 100.0, "robot": "libero", "camera_images": (8, 6)}
 
 
 def test_every_request_of_an_open_loop_is_sent_and_counted_once() -> None:

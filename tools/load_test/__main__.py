@@ -61,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--python", metavar="FILE", help="the clients' interpreter, such as one with openpi-client")
     parser.add_argument("--robot", help="whose observations: a name or a .json; default: as the server's metadata says")
     parser.add_argument("--observation", type=Path, metavar="FILE", help="or one that was recorded")
-    parser.add_argument("--images", metavar="WxH", help="size of all images; default: the robot's own")
+    size = "size of all images; default: the robot's own"
+    parser.add_argument("--pictures", dest="camera_images", metavar="WxH", help=size)
     parser.add_argument("--seed", type=int, default=0, help="of images and arrivals")
     parser.add_argument("--api-key-file", type=Path, metavar="FILE", help="its one line is the server's API key")
     given = parser.parse_args(arguments)

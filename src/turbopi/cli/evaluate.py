@@ -67,7 +67,7 @@ def evaluate_command(
         str | None,
         typer.Option(
             "--control",
-            metavar="prompt|images",
+            metavar="prompt|pictures",
             help="Give the policy another task's prompt, or images: it should fail.",
         ),
     ] = None,

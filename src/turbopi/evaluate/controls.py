@@ -12,8 +12,8 @@ from turbopi.evaluate.sources import Answer, PolicySource
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
-Control = Literal["prompt", "images"]
-CONTROLS: tuple[Control, ...] = ("prompt", "images")
+Control = Literal["prompt", "pictures"]
+CONTROLS: tuple[Control, ...] = ("prompt", "pictures")
 _GRAY = 128
 
 

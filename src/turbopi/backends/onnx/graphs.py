@@ -123,7 +123,7 @@ class Graph:
 def graphs(model: Pi0Model) -> list[Graph]:
     """The four graphs of a float32 model, in the order they run."""
     config = model.config
-    n, p, s, h = (torch.export.Dim(name) for name in ("images", "prompt", "prefix", "horizon"))
+    n, p, s, h = (torch.export.Dim(name) for name in ("pictures", "prompt", "prefix", "horizon"))
     some, horizon = 5, 7  # lengths of the examples: any but 0 and 1, which would be taken for constants
     side = config.vision.image_size
     cache = torch.zeros(config.vlm.depth, 1, config.vlm.num_kv_heads, some, config.vlm.head_dim)

@@ -50,7 +50,7 @@ class Preview(Struct, frozen=True):
     prompt: str
     actions: list[list[float | None]]
     numbers: dict[str, list[float | None]]
-    images: dict[str, Thumbnail] = field(name="images")
+    images: dict[str, Thumbnail] = field(name="pictures")
     timing: dict[str, float | None]
     note: str = ""
 

@@ -19,7 +19,7 @@ PLAIN = {  # by name: the runs without delay, and the controls
     "float32": "`pytorch`, float32",
     "fused": "`fused`, bfloat16",
     "prompt": "control: the prompt of another task",
-    "images": "control: the images of another task",
+    "pictures": "control: the images of another task",
 }
 DELAYED = {  # by name: the execution mode and its delay
     "async_2": ("async", 2),
