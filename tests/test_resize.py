@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,15 @@ SIZES = (
     *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2)),
 )
 WAYS = tuple(RESIZES)
+
+
+@pytest.fixture(autouse=True)
+def two_threads() -> Iterator[None]:
+    """With one thread PyTorch sums in another order: its bilinear kernel is chosen by their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 def camera_image(height: int, width: int, seed: int = 0) -> np.ndarray:
