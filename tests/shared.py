@@ -82,6 +82,15 @@ def golden_model(kind: Kind, precision: FloatPrecision = "f32") -> Pi0Model:
     return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """With one thread PyTorch sums in another order: its bilinear kernel is chosen by their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(autouse=True)
 def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the user's cache remembers of weights stays out of tests."""

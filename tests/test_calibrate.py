@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 from cli_helpers import refusal, turbopi
-from conftest import TWO_LAYERS, golden_cases, golden_folder, golden_model
+from conftest import golden_cases, golden_folder, golden_model
 from file_helpers import no_room
+from shared import TWO_LAYERS
 from torch import nn
 
 from turbopi import backends

@@ -97,7 +97,7 @@ def test_a_broken_pipe_that_is_not_the_output_is_no_quiet_end() -> None:
         "from turbopi.cli import process, framework\n"
         "def work(): raise BrokenPipeError(32, 'Broken pipe')\n"
         "process.run(lambda: framework.app())\n"
-    ).replace("framework.app()", "exit_of(lambda: framework.with_errors_told(work, debug=False))")
+    ).replace("framework.app()", "exit_of(lambda: framework.with_errors_reported(work, debug=False))")
     helper = (
         "import sys, typer\n"
         "def exit_of(work):\n"
@@ -151,12 +151,12 @@ def test_ctrl_c_ends_the_process_with_130(moment: str) -> None:
     body = textwrap.indent(textwrap.dedent(MOMENTS[moment]).strip(), "    ")
     code = (
         "import os, signal, sys, threading, time, typer\n"
-        "from turbopi.cli.framework import with_errors_told\n"
+        "from turbopi.cli.framework import with_errors_reported\n"
         "from turbopi.cli.process import interrupts_end_at_once, run\n"
         "def tell(): print('READY', flush=True)\n"
         f"def work():\n{body}\n"
         "def main():\n"
-        "    try: with_errors_told(work, debug=False)\n"
+        "    try: with_errors_reported(work, debug=False)\n"
         "    except typer.Exit as end: sys.exit(end.exit_code)\n"
         "run(main)"
     )

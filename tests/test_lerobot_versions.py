@@ -126,6 +126,7 @@ def test_the_choice_is_for_lerobots_checkpoints_alone(tmp_path: Path) -> None:
         open_checkpoint(folder)
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_0_4_writes_zeros_into_the_prompt_and_pads_pictures_with_minus_three(tmp_path: Path) -> None:
     pipelines = {}
     for version in ("0.4.4", "0.6.1"):

@@ -90,10 +90,10 @@ def test_a_forked_child_has_threads_of_its_own() -> None:
 import os, numpy as np
 from turbopi.preprocess import images
 images._cores = lambda: 2
-images = [np.ones((480, 640, 3), np.uint8)] * 2
-images.all_fitted(images, 224, "openpi")
+arrays = [np.ones((480, 640, 3), np.uint8)] * 2
+images.all_fitted(arrays, 224, "openpi")
 child = os.fork()
-images.all_fitted(images, 224, "openpi")
+images.all_fitted(arrays, 224, "openpi")
 if child:
     assert os.waitpid(child, 0)[1] == 0
 """
@@ -137,7 +137,7 @@ def test_a_first_axis_of_three_counts_as_chw() -> None:
 BAD: list[tuple[Any, str]] = [
     (np.zeros((20, 30, 3), np.int64), "cam has dtype int64; send uint8"),
     (np.zeros((20, 30, 3), np.bool_), "cam has dtype bool"),
-    (np.array("image"), "cam has dtype <U7"),
+    (np.array("image"), "cam has dtype <U5"),
     (np.zeros((20, 30), np.uint8), r"cam has shape \(20, 30\); send one image"),
     (np.zeros((1, 20, 30, 3), np.uint8), "without a batch axis"),
     (np.zeros((0, 30, 3), np.uint8), "cam is empty"),

@@ -2,7 +2,6 @@
 
 import ctypes
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.images import RESIZES, fitted, placement
 from turbopi.support.errors import ObservationError
 
+pytestmark = pytest.mark.usefixtures("two_threads")
 SIDE = 224  # PyTorch sums in another order where a result's height and width are 128 together, or less
 # (height, width): cameras' own, larger and smaller, odd, square, narrow, one axis kept, already of the size
 SIZES = (
@@ -27,15 +27,6 @@ SIZES = (
     *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2)),
 )
 WAYS = tuple(RESIZES)
-
-
-@pytest.fixture(autouse=True)
-def two_threads() -> Iterator[None]:
-    """With one thread PyTorch sums in another order: its bilinear kernel is chosen by their number."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 def camera_image(height: int, width: int, seed: int = 0) -> np.ndarray:

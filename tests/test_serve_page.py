@@ -431,7 +431,7 @@ def test_stages_are_counted_in_shared_bins_and_the_slowest_call_is_in_the_last()
 
 
 @pytest.mark.parametrize(
-    "image",
+    "camera_image",
     [
         np.full((8, 8, 3), 0.5),
         np.full((8, 8, 3), np.nan, np.float32),

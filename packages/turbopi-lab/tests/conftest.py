@@ -13,5 +13,6 @@ from shared import (  # noqa: F401
     on_hopper,
     packed_arrays,
     two_layers,
+    two_threads,
     unseen_plots,
 )

@@ -88,8 +88,8 @@ def serve(
         typer.Option(
             "--deadline-ms",
             metavar="MS",
-            help="From a request to its answer, for robots that don't send their own (docs/serving_sessions.md): it "
-            "sets the order only, nothing is refused for it.",
+            help="From a request to its answer, for robots that don't send their own: it sets the order only, nothing "
+            "is refused for it.",
         ),
     ] = ServerOptions.deadline_ms,
     max_clients: Annotated[

@@ -58,7 +58,8 @@ def vision_tokens(
     v, several, vision = config.vision, len(parts) > 1, ops.vision or VisionByOps(ops)
     eps, following = v.layer_norm_eps, [*(layer.qkv[0] for layer in weights.vision[1:]), weights.projector[0]]
     layers = list(zip(weights.vision, following, strict=True))
-    head, rest, ends = layers[:HEAD_LAYERS], layers[HEAD_LAYERS:], []
+    head = layers[:HEAD_LAYERS]
+    rest, ends = layers[len(head) :], []
     for bring in parts:
         # [images * 256, W]
         stream = VisionStream(ops.embed_patches(bring(), weights.patch, weights.position, out.dtype))

@@ -18,7 +18,7 @@ MOST_SIZES = 16  # of images whose weights are cached
 
 
 class Resizer:
-    """What `Ops.resize_pictures` needs of images of any size: their bytes on the device, and `table`."""
+    """What `Ops.resize_images` needs of images of any size: their bytes on the device, and `table`."""
 
     def __init__(self, images: Tensor) -> None:
         self._images = images

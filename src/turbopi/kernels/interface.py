@@ -33,7 +33,7 @@ class Taps:
     weights: Tensor
 
 
-# What `resize_pictures` is told of each camera's image: int64[len(SOURCE)] in the device's memory, so that a captured
+# What `resize_images` is given of each camera's image: int64[len(SOURCE)] in the device's memory, so that a captured
 # graph takes images of any size. Addresses of the image uint8[height, width, 3] and of its `Taps`; sizes; where in
 # the result it begins, and how much of it it fills (no rows: the result stays as it is); `kernels.plain`'s `low`.
 SOURCE = (

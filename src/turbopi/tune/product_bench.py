@@ -43,7 +43,7 @@ class StreamNorm:
 
 
 class ProductBench(GpuBench):
-    """x @ weightᵀ with its epilogue, and the norms around it. A subclass makes `exact` and `twin_error`."""
+    """x @ weightᵀ with its epilogue, and the norms around it. A subclass makes `exact` and `reference_error`."""
 
     def __init__(self, operation: Operation, device: torch.device, input_scale: float) -> None:
         """input_scale: of E4M3 inputs."""

@@ -1,4 +1,4 @@
-"""Cameras' images to the vision tower's size. Twin: `kernels.plain.resize_picture`, which says what is computed."""
+"""Cameras' images to the vision tower's size. Reference: `kernels.plain.resize_image`, which says what is computed."""
 
 import torch
 import triton

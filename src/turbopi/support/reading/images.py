@@ -17,7 +17,7 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")  # 
 def read_image(file: str | Path) -> np.ndarray:
     """The image in a file, RGB uint8[h, w, 3]; transparency is dropped.
 
-    Raises ObservationError for what is none of PICTURE_FORMATS (whatever its name; an EPS would be handed to
+    Raises ObservationError for what is none of IMAGE_FORMATS (whatever its name; an EPS would be handed to
     Ghostscript), is damaged, has more than MAX_PIXELS, which is checked before anything is decoded, or has more than 8
     bits a channel, which Pillow would clip.
     """

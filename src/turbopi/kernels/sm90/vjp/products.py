@@ -142,6 +142,6 @@ ACROSS = replace(FEW_TOKENS, down_vjp=down_vjp, out_vjp=out_vjp, gate_up_vjp=gat
 
 
 def backward_form(expert: GemmaConfig, tokens: int, masked: bool = False) -> BackwardOps:
-    """See `portable.vjp.ops.way_back`."""
+    """See `portable.vjp.ops.backward_form`."""
     found = portable_backward(expert, tokens, masked)
     return ACROSS if found is FEW_TOKENS and tokens <= MOST_TOKENS else found
