@@ -61,7 +61,7 @@ class EvalOptions(PolicyOptions):
     ] = "episode"
     replan: Annotated[
         int,
-        _option("--replan", panel=_PROTOCOL, metavar="N", help="Actions carried out before the policy is asked again."),
+        _option("--replan", panel=_PROTOCOL, metavar="N", help="Actions carried out before the next inference."),
     ] = 5
     execution: Annotated[
         str,
