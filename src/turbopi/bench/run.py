@@ -228,7 +228,7 @@ def _measure(
             precision=precision,
             job=job,
             calls=latency["total"].calls,
-            load_seconds=(policy.metadata["backend_details"] | policy.metadata)["load_seconds"],
+            load_seconds=(policy.metadata["backend_details"] | policy.metadata).get("load_seconds", 0.0),
             first_call_seconds=round(first / 1e3, 3),
             milliseconds={name: values.times for name, values in latency.items()},
             floor_ms=floor,

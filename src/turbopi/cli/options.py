@@ -286,10 +286,12 @@ class PolicyOptions(RobotOptions):
         about = policy.metadata["backend_details"] | policy.metadata
         if fitting.backend != self.backend:
             about["backend_reason"] = "auto: the folder holds ONNX graphs"
+        loaded = ""  # a backend of another package may load no weights
+        if "weight_bytes" in about:
+            loaded = f"; weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
-            f"({about['device_name']}), {denoising(about)}; "
-            f"weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
+            f"({about['device_name']}), {denoising(about)}{loaded}"
         )
         if self.precision is None and about["precision"] != "bf16":
             output.line(f"precision: {about['precision']}, as {about['backend']} doesn't run in bf16")
