@@ -108,7 +108,9 @@ def test_episodes_that_are_asked_for_without_a_simulator_are_refused(tmp_path: P
     assert "The policy didn't act in the simulator: LIBERO isn't installed here" in " ".join(reported.stdout.split())
 
 
-def swapped_cameras(self: PyTorchBackend, observation: Observation, noise: torch.Tensor, num_steps: int) -> Sample:
+def swapped_cameras(
+    self: PyTorchBackend, observation: Observation, noise: torch.Tensor, num_steps: int, **options: Any
+) -> Sample:
     """A fault of the fast path alone: the oracle, in f32, is spared."""
     if self.precision == "bf16":
         observation = replace(observation, images=observation.images[:, [1, 0, 2]])

@@ -3,8 +3,8 @@
 // tests/test_kernels_barriers.py reads these tables and the code, and fails where they differ: a barrier, an arrival or a
 // wait that only one of them has, another count, other bytes. So change both: counts are set by `barrier_init` in
 // kernel.cu and many/loop.cu. A line that the test's planted faults quote changes there, too. "few/" and "many/" are the
-// two forms' folders; "gather ×2" stands twice in `gather`. Warps: 0-15 multiply, 16 loads (Producer), 17 watches, 18 makes 1 / rms,
-// 19 helps (many: fetches the stream).
+// two forms' folders; "gather ×2" stands twice in `gather`. Warps: 0-15 multiply, 16 loads (Producer), 17 watches, 18
+// makes 1 / rms, 19 helps (many: fetches the stream).
 //
 // ---- mbarriers, in shared memory at M_BAR
 //
