@@ -4,6 +4,7 @@ import importlib
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,29 @@ def test_public_names_are_the_objects_that_their_modules_define() -> None:
     for name, module in (("UnifiedPolicy", "policy"), ("Robot", "robots"), ("open_checkpoint", "checkpoint")):
         assert getattr(turbopi, name) is getattr(importlib.import_module(f"turbopi.{module}"), name)
     assert turbopi.support.errors is errors
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *(
+            ("errors", "support.errors"),
+            ("client", "realtime.client"),
+            ("execution", "realtime"),
+            ("wire", "realtime.wire"),
+        ),
+        *(("model.denoise", "models.pi0.denoise"), ("serve.schedule", "serve.scheduling.schedule")),
+    ],
+)
+def test_a_name_of_0_1_is_the_moved_module_and_warns(old: str, new: str) -> None:
+    sys.modules.pop(f"turbopi.{old}", None)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = importlib.import_module(f"turbopi.{old}")
+    assert found is importlib.import_module(f"turbopi.{new}")
+    assert found.__spec__ is not None and found.__spec__.name == f"turbopi.{new}"
+    said = {str(one.message) for one in seen if one.category is DeprecationWarning}
+    assert (f"turbopi.{old} is turbopi.{new} now" in said) is (old != "errors")
 
 
 def test_every_error_is_public() -> None:
