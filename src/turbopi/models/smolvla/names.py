@@ -5,7 +5,6 @@ those of `SmolVLAModel`'s parameters.
 """
 
 import re
-from collections.abc import Iterable
 
 import torch
 
@@ -40,13 +39,6 @@ def canonical_name(name: str, config: SmolVLAConfig) -> str | None:
             layer = re.match(r"layers\.(\d+)\.", canonical)
             return None if layer and int(layer[1]) >= config.text.depth else canonical
     raise KeyError(name)
-
-
-def unused_last_layer(names: Iterable[str], config: SmolVLAConfig) -> set[str]:
-    """Of canonical names, those of the last text layer that give no key or value: a file may lack them."""
-    last = f"layers.{config.text.depth - 1}."
-    needed = ("input_layernorm.", "self_attn.k_proj.", "self_attn.v_proj.")
-    return {name for name in names if name.startswith(last) and not name.removeprefix(last).startswith(needed)}
 
 
 def parameter_dtype(name: str, config: SmolVLAConfig) -> torch.dtype:
