@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from turbopi.realtime import WAYS, ChunkQueue, DelayEstimate, Request, way_named
+from turbopi.realtime import WAYS, ChunkQueue, DelayEstimate, Request, Seam, way_named
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import ConfigError
 
@@ -105,6 +105,13 @@ def test_the_policy_is_told_what_runs(name: str, horizon: int, s: int, delays: l
         assert reported.anchor is not None and reported.anchor[0] < request.number
         if name == "rtc_trained" and most is not None:
             assert reported.delay <= most
+
+
+def test_the_old_name_of_the_reported_delay_is_found_with_a_warning() -> None:
+    seam = Seam(step=8, chunk=1, delay=2, carried_out=2, reported=3, jump=np.zeros(7), gap=None)
+    with pytest.warns(DeprecationWarning, match=r"Seam\.reported"):
+        assert getattr(seam, "told") == 3  # noqa: B009
+    assert not hasattr(seam, "no_such_name")
 
 
 @given(horizon=st.integers(2, 16), s=st.integers(1, 16), d=st.integers(0, 16), name=st.sampled_from(ASYNC))

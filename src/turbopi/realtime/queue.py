@@ -7,6 +7,7 @@ no actions, or its way is "sync") carried out none, and enters at row 0.
 """
 
 import copy
+import warnings
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -86,9 +87,16 @@ class Seam:
     chunk: int
     delay: int  # control steps from the observation to the chunk
     carried_out: int  # actions among them: the row at which the chunk is entered
-    reported: int | None  # the delay that the policy was told, if it was told of a running chunk
+    reported: int | None  # the delay that the policy was given, if it was given a running chunk
     jump: np.ndarray  # float64[d]  its first action − the last command
     gap: np.ndarray | None  # float64[d]  its first action − what the running chunk has for that step, if it has it
+
+    def __getattr__(self, name: str) -> int | None:
+        """`told`, the name that `reported` had before, for one version: with a DeprecationWarning."""
+        if name != "told":
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+        warnings.warn("Seam.told: the name is now Seam.reported", DeprecationWarning, stacklevel=2)
+        return self.reported
 
 
 @dataclass
