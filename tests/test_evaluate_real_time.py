@@ -104,7 +104,7 @@ class World:
         self.actions, self.times, self.seen = [], [], True
 
     def observation(self) -> dict[str, Any]:
-        assert self.seen, "the step before wasn't told to look"
+        assert self.seen, "the step before took no images"
         return {"image": np.full((2, 2, 3), len(self.actions), np.uint8), "count": len(self.actions)}
 
     def step(self, action: np.ndarray, look: bool) -> bool:

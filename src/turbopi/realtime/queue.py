@@ -1,4 +1,4 @@
-"""The queue of actions: which action is next, what the policy is told of the running chunk, where the new one joins.
+"""The queue of actions: which action is next, what the policy is given of the running chunk, where the new one joins.
 
 Everything is counted in actions that the robot carried out. Row i of a chunk is meant for the i-th action after its
 observation. When the robot has carried out n actions between an observation and the chunk computed from it, the chunk
@@ -26,7 +26,7 @@ OLD_WEIGHT = 0.3  # LeRobot's default
 KEPT = 10_000  # seams and delays of one queue
 
 # Why a chunk was never carried out:
-#   late        "rtc_trained": more actions were carried out than it was told; it continues those that it was told
+#   late        "rtc_trained": more actions were carried out than it was given; it continues those that it was given
 #   used_up     all of its actions belong to the past
 #   not_finite  a number in it is NaN, infinite or beyond float32
 #   jump        the command would move by more than `max_jump` in one step
@@ -113,7 +113,7 @@ class ChunkQueue:
     """Joins chunks, by one of the ways to run. Deterministic; not for several threads at once.
 
     execution_horizon    s, actions of a chunk after which the next observation is taken; at most H. None: half of H
-    delay                control steps from an observation to its chunk that the policy is told: fixed, or an estimate,
+    delay                control steps from an observation to its chunk that the policy is given: fixed, or an estimate,
                          to which the queue adds what it measures. Only the "rtc" ways use it
     trained_max_delay    "rtc_trained": the largest delay that the checkpoint was trained with. None: not known
     max_jump             the most that a command may move in one step, in the robot's units: one number or float[d],
@@ -252,7 +252,7 @@ class ChunkQueue:
         return request
 
     def _previous(self, ago: int) -> RunningChunk | None:
-        """What the policy is told of the running chunk at an observation, or None if nothing of that is left."""
+        """What the policy is given of the running chunk at an observation, or None if nothing of that is left."""
         if self.way.mode is None or self._running is None:
             return None
         row, expected = self._row - ago, max(self._delay.steps, ago)
@@ -261,7 +261,7 @@ class ChunkQueue:
         return previous
 
     def _reported(self, chunk: Chunk, row: int, expected: int) -> RunningChunk | None:
-        """What the policy is told of a chunk whose next action is `row`; the delay is cut to what fits."""
+        """What the policy is given of a chunk whose next action is `row`; the delay is cut to what fits."""
         if self.way.mode is None or row >= len(chunk.actions):
             return None
         assert chunk.model_actions is not None

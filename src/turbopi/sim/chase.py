@@ -1,7 +1,7 @@
 """A built-in dynamic task: catch a target that runs around a post and turns back without warning. NumPy alone.
 
 It has LIBERO's observations and actions, as the reacher. Unlike there, and unlike in LIBERO, time matters: whoever
-acts on an old image runs the wrong way, and whoever stands still while thinking is too slow.
+acts on an old image runs the wrong way, and one that stands still while thinking is too slow.
 
     target   runs on a circle around the post, and turns back at random moments, which nobody can foresee
     tip      action[:2], cut to length 1, moves it by SPEED in that direction; the other numbers do nothing
@@ -174,7 +174,7 @@ class ChaseEnvironment:
         self._images: list[np.ndarray] = self.draw()
 
     def observation(self) -> dict[str, Any]:
-        assert self._images, "the step before wasn't told to look"
+        assert self._images, "the step before took no images"
         base, wrist = self._images
         return {
             "observation/image": base,

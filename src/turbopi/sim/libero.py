@@ -116,7 +116,7 @@ class LiberoEnvironment:
             self.step(WAIT_ACTION, look=step == self.settings.wait_steps - 1)
 
     def observation(self) -> dict[str, Any]:
-        assert self._images, "the step before wasn't told to look"
+        assert self._images, "the step before took no images"
         return {**self._images, "observation/state": openpi_state(self._obs), "prompt": self.instruction}
 
     def step(self, action: np.ndarray, look: bool) -> bool:

@@ -76,7 +76,7 @@ class ReacherEnvironment:
             self.step(np.zeros(7), look=step == self.settings.wait_steps)
 
     def observation(self) -> dict[str, Any]:
-        assert self._images, "the step before wasn't told to look"
+        assert self._images, "the step before took no images"
         base, wrist = self._images
         return {
             "observation/image": base,

@@ -199,7 +199,7 @@ class Certificate(Judged, frozen=True, kw_only=True):
     precision: str
     steps: int  # of denoising
     oracle: str
-    oracle_float32: Mapping[str, object]  # what PyTorch was told of float32's products: models/pi0/exact.py
+    oracle_float32: Mapping[str, object]  # PyTorch's settings for float32's products: models/pi0/exact.py
     control: str
     not_exposed: list[str]  # the reference's intermediates that the backend doesn't show
     latency_ms: Latencies

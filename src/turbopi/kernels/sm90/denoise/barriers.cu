@@ -8,7 +8,7 @@
 //
 // ---- mbarriers, in shared memory at M_BAR
 //
-// count    arrivals that end a phase. A barrier with bytes has one of them for whoever arms it (`barrier_expect`)
+// count    arrivals that end a phase. A barrier with bytes has one of them for the thread that arms it (`barrier_expect`)
 // bytes    that must land, too, before the phase ends; thread 0 arms the next phase behind its wait (`receive`)
 // arrives  functions that arrive, or send or copy bytes that count
 // waits    functions that wait, with the number of the phase: its lowest bit is the parity
