@@ -684,7 +684,7 @@ def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
+def test_a_certificate_is_made_on_what_was_not_calibrated_on_and_says_so(tmp_path: Path) -> None:
     checkpoint = random_checkpoint("pi05_tiny")
     policy = UnifiedPolicy(shipped.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
     for number in range(2):
@@ -693,9 +693,12 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     seen = [sample.sha256 for sample in read_examples(policy, str(tmp_path), 2)[1]]
     report = {"observations": {"source": "x", "calibration": {"1": seen[1], "other": "0" * 64}}, "warnings": []}
     arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
-    plan = VerifyPlan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
-    document = verify(checkpoint, plan)
-    assert document.observations.calibrated_on == 1
+    arguments |= {"quantization": made_up(report=report)}
+    for count in (None, 1):
+        document = verify(checkpoint, VerifyPlan(arguments, tmp_path, count, noises=1))
+        assert (document.observations.calibrated_on, document.observations.names) == (0, ["0.npz"])
+    document = verify(checkpoint, VerifyPlan(arguments, tmp_path, 2, noises=1))
+    assert (document.observations.calibrated_on, document.observations.names) == (1, ["0.npz", "1.npz"])
     assert document.calibrated is not None and document.calibrated["observations"] == "x"
 
 

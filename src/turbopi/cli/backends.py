@@ -1,6 +1,6 @@
-"""`turbopi backends`."""
+"""The list of backends, a part of `turbopi doctor`, and that command's old name."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -10,19 +10,25 @@ from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import BackendUnavailable, ConfigError
 
+DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
+PrecisionOption = Annotated[
+    str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
+]
 
-@command("backends", examples=("turbopi backends", "turbopi backends --device cpu --json"))
-def backends(
-    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
-    precision: Annotated[
-        str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
-    ] = "bf16",
-    as_json: JsonFlag = False,
-) -> None:
-    """List the backends: whether each can run here, in which precisions, and why not."""
+
+@command("backends", hidden=True, examples=("turbopi backends", "turbopi backends --device cpu --json"))
+def backends(device: DeviceOption = "auto", precision: PrecisionOption = "bf16", as_json: JsonFlag = False) -> None:
+    """List the backends. A part of `turbopi doctor`, whose name this was."""
+    output = Output(as_json)
+    found = show_backends(device, precision, output)
+    output.line("note: `turbopi doctor` has this list, too; `turbopi backends` goes with the next version", "yellow")
+    output.document(found)
+
+
+def show_backends(device: str, precision: str, output: Output) -> dict[str, Any]:
+    """Print whether each backend can run here, in which precisions, and why not; the same as JSON values."""
     from turbopi import backends as registry
 
-    output = Output(as_json)
     resolved = registry.resolve_device(device)
     if precision not in registry.PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
@@ -54,6 +60,4 @@ def backends(
     except BackendUnavailable as error:
         why = f"auto can't run in {precision} here: {error}"
         output.line(why, "yellow")
-    output.document(
-        {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}
-    )
+    return {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}

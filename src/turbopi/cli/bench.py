@@ -152,7 +152,7 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
 def bench(
     options: RobotOptions,
     checkpoint: CheckpointArgument = None,
-    backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi backends`.")] = "auto",
+    backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi doctor`.")] = "auto",
     beside: Annotated[
         str, typer.Option(metavar="NAME,NAME,…", help="Backends that are measured on the main job alone.")
     ] = "",

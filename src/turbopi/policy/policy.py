@@ -54,7 +54,7 @@ class UnifiedPolicy:
         checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or an open `Checkpoint`.
         config: what no checkpoint records: a preset's name, a .json, a PolicyConfig, or "auto" for LeRobot's own config
             or the `turbopi.json` beside the weights.
-        backend: a name from `turbopi backends`; "auto" takes the fastest one available (see `metadata`).
+        backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`).
         precision: "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8" (docs/quantization.md).
         quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
         num_denoising_steps: evaluations of the action expert in a call. None: the config's.

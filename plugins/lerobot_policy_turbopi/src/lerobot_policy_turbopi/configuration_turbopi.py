@@ -36,7 +36,7 @@ class TurboPiConfig(PreTrainedConfig):
     checkpoint           its folder, or its name on the Hugging Face hub (owner/name, with `pretrained_revision`)
     server               in place of a checkpoint: ws://HOST:PORT, a `turbopi serve CHECKPOINT` that computes for this
                          robot. It decides about backend, precision and steps. Its key: the variable TURBOPI_API_KEY
-    backend              a name from `turbopi backends`; "auto" takes the fastest one available
+    backend              a name from `turbopi doctor`; "auto" takes the fastest one available
     precision            "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
     quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json or
                          turbopi_int8.json in its folder
