@@ -20,13 +20,14 @@ PrecisionOption = Annotated[
 def backends(device: DeviceOption = "auto", precision: PrecisionOption = "bf16", as_json: JsonFlag = False) -> None:
     """List the backends. A part of `turbopi doctor`, whose name this was."""
     output = Output(as_json)
-    found = show_backends(device, precision, output)
+    found = list_backends(device, precision)
+    show_backends(found, output)
     output.line("note: `turbopi doctor` has this list, too; `turbopi backends` goes with the next version", "yellow")
     output.document(found)
 
 
-def show_backends(device: str, precision: str, output: Output) -> dict[str, Any]:
-    """Print whether each backend can run here, in which precisions, and why not; the same as JSON values."""
+def list_backends(device: str, precision: str) -> dict[str, Any]:
+    """Whether each backend can run here, in which precisions, and why not, as JSON values. Raises ConfigError."""
     from turbopi import backends as registry
 
     resolved = registry.resolve_device(device)
@@ -34,6 +35,11 @@ def show_backends(device: str, precision: str, output: Output) -> dict[str, Any]
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
     chosen, why = registry.choose(resolved, precision)
     why = as_typed(why)
+    try:
+        registry.check(chosen, resolved, precision)
+        runs = True
+    except BackendUnavailable as error:
+        why, runs = f"auto can't run in {precision} here: {error}", False
     listed = [
         {
             "name": spec.name,
@@ -45,19 +51,29 @@ def show_backends(device: str, precision: str, output: Output) -> dict[str, Any]
         }
         for spec in registry.listed().values()
     ]
-    table = Table(title=f"backends on {resolved}", title_justify="left")
+    return {
+        "device": str(resolved),
+        "precision": precision,
+        "auto": chosen,
+        "auto_reason": why,
+        "auto_runs": runs,
+        "backends": listed,
+    }
+
+
+def show_backends(found: dict[str, Any], output: Output) -> None:
+    """Print what `list_backends` found."""
+    table = Table(title=f"backends on {found['device']}", title_justify="left")
     for column in ("backend", "available", "precisions", "what it is, or why it can't run and what to do"):
         table.add_column(column)
-    for entry in listed:
+    for entry in found["backends"]:
         mark = "[green]yes[/]" if entry["available"] else "[red]no[/]"
         name = f"[bold]{entry['name']}[/] (auto)" if entry["auto"] else str(entry["name"])
         about = str(entry["summary"] if entry["available"] else entry["reason"])
-        table.add_row(name, mark, ", ".join(registry.precisions(str(entry["name"]))), escape(about))
+        table.add_row(name, mark, ", ".join(entry["precisions"]), escape(about))
     output.table(table)
-    try:
-        registry.check(chosen, resolved, precision)
-        output.line(f"auto takes {chosen} in {precision}: {why.removeprefix('auto: ')}")
-    except BackendUnavailable as error:
-        why = f"auto can't run in {precision} here: {error}"
+    why = found["auto_reason"]
+    if found["auto_runs"]:
+        output.line(f"auto takes {found['auto']} in {found['precision']}: {why.removeprefix('auto: ')}")
+    else:
         output.line(why, "yellow")
-    return {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}

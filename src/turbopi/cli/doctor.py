@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from turbopi.cli.backends import DeviceOption, PrecisionOption, show_backends
+from turbopi.cli.backends import DeviceOption, PrecisionOption, list_backends, show_backends
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 
 STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
@@ -46,6 +46,8 @@ def doctor(
     from turbopi.cli.checkups import examine
 
     rows = list(examine(checkpoint=checkpoint, config=config, tokenizer=tokenizer, port=port))
+    works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
+    found = list_backends(device, precision) if works else {}
     width = max(len(row.name) for row in rows)
     for row in rows:  # lines and not a table, so that a command can be copied whole
         output.styled(f"[{STYLES[row.level]}]{row.level:<4}[/]  [bold]{row.name:<{width}}[/]  {escape(row.found)}")
@@ -53,8 +55,8 @@ def doctor(
             output.styled(f"{'':<{width + 8}}[cyan]->[/] {escape(row.fix)}")
     counts = {level: sum(row.level == level for row in rows) for level in STYLES}
     summary = f"{counts['OK']} OK, {counts['WARN']} warnings, {counts['FAIL']} failed"
-    works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
-    found = show_backends(device, precision, output) if works else {}
+    if found:
+        show_backends(found, output)
     output.line(summary, STYLES["FAIL" if counts["FAIL"] else "OK"])
     output.document({"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows], **found})
     if counts["FAIL"]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from turbopi.policy.policy import UnifiedPolicy
     from turbopi.realtime.running_chunk import JoinMode
+    from turbopi.recordings.format import RecordImages
 
 _NETWORK, _QUEUE = "Network", "Queue, batches, warm-up"
 _REAL_TIME, _RECORDING = "Real-time execution", "Recording"
@@ -133,6 +134,25 @@ def serve(
             help="Write every observation and its actions below DIR.",
         ),
     ] = None,
+    record_limit: Annotated[
+        str | None,
+        typer.Option(
+            "--record-limit",
+            metavar="SIZE,AGE",
+            rich_help_panel=_RECORDING,
+            help="What stays below DIR, such as 20GB, 7d or 20GB,7d: the oldest calls are removed, and the log says "
+            "how many. Unless given, all stays.",
+        ),
+    ] = None,
+    record_images: Annotated[
+        str,
+        typer.Option(
+            "--record-images",
+            metavar="exact|png|jpeg",
+            rich_help_panel=_RECORDING,
+            help="png: the same pixels, smaller; jpeg: a tenth of the size, pixels nearly the same.",
+        ),
+    ] = ServerOptions.record_images,
     page: Annotated[
         bool | None,
         typer.Option(
@@ -230,6 +250,8 @@ def serve(
         max_batch=max_batch,
         deadline_ms=deadline_ms,
         record_dir=record,
+        record_limit=record_limit,
+        record_images=cast("RecordImages", record_images),  # checked there
         allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,
         page=page,

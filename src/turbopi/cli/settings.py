@@ -37,11 +37,15 @@ Settings = Annotated[
         metavar="FILE",
         is_eager=True,
         callback=read_settings,
+        rich_help_panel="Settings",
         help="Options from a TOML file, such as `port = 8001`; the command line wins.",
     ),
 ]
 PrintSettings = Annotated[
-    bool, typer.Option("--print-settings", help="Print all options as such a file, and start nothing.")
+    bool,
+    typer.Option(
+        "--print-settings", rich_help_panel="Settings", help="Print all options as such a file, and start nothing."
+    ),
 ]
 
 
