@@ -141,6 +141,18 @@ def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: P
     np.testing.assert_array_equal(actions_in(tmp_path), chunks[0])
 
 
+def test_actions_replace_earlier_ones_with_a_note_and_no_other_file(npz: Path, tmp_path: Path) -> None:
+    assert "replaced" not in infer(tmp_path, npz, "--no-plot").output
+    again = infer(tmp_path, npz, "--no-plot")
+    assert f"note: {tmp_path}/actions.npz is there, and is replaced; --out names another file" in again.output
+    mine = tmp_path / "mine.npz"
+    np.savez(mine, actions=np.zeros(3))
+    refused = refusal(turbopi("infer", *TINY, npz, "-o", mine))
+    assert refused == f"{mine} is there and isn't what `turbopi infer` wrote, so it isn't replaced; name another file"
+    with np.load(mine) as archive:
+        assert archive["actions"].shape == (3,)
+
+
 def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "by hand"
     folder.mkdir()

@@ -12,13 +12,19 @@ from cli_helpers import turbopi
 
 from turbopi.cli import app
 
-pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots", "unread_settings")
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 GROUP = typer.main.get_command(app)
 _BLOCK = re.compile(r"^```[a-z]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"`turbopi ([^`]+)`")
+
+
+@pytest.fixture
+def unread_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The documents' `--settings robot.toml` isn't here."""
+    monkeypatch.setattr("turbopi.cli.settings._use", lambda *_: None)
 
 
 def commands(document: Path) -> Iterator[list[str]]:
