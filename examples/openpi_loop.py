@@ -92,7 +92,8 @@ class Policy:
             age = time.monotonic() - self._taken_at
             if what == "chunk" and age <= oldest_s and np.isfinite(value).all():
                 return list(value[:EXECUTED])
-            print(f"no actions: {what} ({f'after {age:.1f} s' if what == 'chunk' else value})")
+            if what != "connected":
+                print(f"no actions: {what} ({f'after {age:.1f} s' if what == 'chunk' else value})")
         if self._ready:
             self._ready, self._taken_at = False, time.monotonic()
             self._observations.put(observe())

@@ -295,7 +295,11 @@ class _StderrHandler(logging.Handler):
         time = f"{_iso(record.created)} " if self.stamped else ""
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         with contextlib.suppress(OSError, ValueError):  # whoever read the log has left: no reason to stop working
-            print(f"{time}{level}{as_typed(record.getMessage())}", file=sys.stderr, flush=True)
+            text = f"{time}{level}{as_typed(record.getMessage())}"
+            if sys.stderr.isatty() and not self.stamped:
+                new_console(stderr=True).print(escape(text), highlight=False)
+            else:
+                print(text, file=sys.stderr, flush=True)
             if record.exc_info:
                 traceback.print_exception(*record.exc_info, file=sys.stderr)
 

@@ -207,6 +207,7 @@ def measure(
         ),
         lambda begin, advance: Progress(begin, advance, done),
         output,
+        first="preparing",
     )
 
 
