@@ -270,7 +270,7 @@ def serve(
             "note: `ps` shows a key on the command line to all; --api-key-file or TURBOPI_API_KEY hides it", "yellow"
         )
     if ray:
-        given = [name for name in context.params if _was_given(context, name)]
+        given = [name for name in context.params if name != "settings" and _was_given(context, name)]
         requested = Requested(options, wanted, warmup, strict)
         serve_fleet(wishes, requested, checkpoint, output, given=given, before_serving=_log_all)
         return

@@ -47,7 +47,8 @@ def read_examples(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[Example]:
         yield from prepared(policy, _observations(policy, plan))
         return
     files = chosen_files(plan.observations, plan.count)
-    files += [one for one in chosen_files(plan.observations) if one not in files]
+    first = set(files)
+    files += [one for one in chosen_files(plan.observations) if one not in first]
     count, unseen, seen = len(files) if plan.count is None else plan.count, 0, []
     for example in prepared(policy, ((name, load_observation(file)) for name, file in files)):
         if example.sha256 in plan.calibrated:
