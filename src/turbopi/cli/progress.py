@@ -20,21 +20,20 @@ def with_stages(
 ) -> Result:
     """work(told(begin, advance)): `begin(text, total)` opens a stage, `advance()` is one step of it.
 
-    `first` is what goes on before the first stage. Where nobody watches a bar, each stage is a line.
+    `first` goes on before the first stage, and is a line. Where nobody watches a bar, each stage is one, too.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = new_console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
-        task = bar.add_task(first, total=None)
+        task = bar.add_task("", total=None, visible=False)
 
         def say(text: str) -> None:
-            if not output.shows_progress:
-                console.print(escape(f"{text} …"), style="dim", highlight=False, soft_wrap=True)
+            console.print(escape(f"{text} …"), style="dim", highlight=False, soft_wrap=True)
 
         def begin(text: str, total: int) -> None:
-            bar.reset(task, description=text, total=total)
-            say(text)
+            bar.reset(task, description=text, total=total, visible=True)
+            if not output.shows_progress:
+                say(text)
 
         say(first)
-
         return work(reported(begin, lambda: bar.advance(task)))
