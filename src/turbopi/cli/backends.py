@@ -4,7 +4,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
@@ -62,16 +61,15 @@ def list_backends(device: str, precision: str) -> dict[str, Any]:
 
 
 def show_backends(found: dict[str, Any], output: Output) -> None:
-    """Print what `list_backends` found."""
-    table = Table(title=f"backends on {found['device']}", title_justify="left")
-    for column in ("backend", "available", "precisions", "what it is, or why it can't run and what to do"):
-        table.add_column(column)
+    """Print what `list_backends` found, in lines, so that a command can be copied whole."""
+    output.line(f"backends on {found['device']}", "bold")
+    width = max(len(entry["name"]) for entry in found["backends"])
     for entry in found["backends"]:
-        mark = "[green]yes[/]" if entry["available"] else "[red]no[/]"
-        name = f"[bold]{entry['name']}[/] (auto)" if entry["auto"] else str(entry["name"])
+        mark = "[green]yes[/]" if entry["available"] else "[red]no[/] "
+        precisions = ", ".join(entry["precisions"]) + ("  (auto)" if entry["auto"] else "")
+        output.styled(f"{mark}   [bold]{entry['name']:<{width}}[/]  {precisions}")
         about = str(entry["summary"] if entry["available"] else entry["reason"])
-        table.add_row(name, mark, ", ".join(entry["precisions"]), escape(about))
-    output.table(table)
+        output.styled(f"      [dim]{escape(about)}[/]")
     why = found["auto_reason"]
     if found["auto_runs"]:
         output.line(f"auto takes {found['auto']} in {found['precision']}: {why.removeprefix('auto: ')}")
