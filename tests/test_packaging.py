@@ -74,7 +74,7 @@ def test_the_wheel_works_in_an_environment_of_its_own(wheel: Path, tmp_path: Pat
         return ended.stdout
 
     assert str(site) in python("-c", "import turbopi; print(turbopi.__file__)")
-    assert "fused" in python("-m", "turbopi", "doctor", "--device", "cpu")
+    assert "fused" in python("-m", "turbopi", "backends", "--device", "cpu")
     text = python("-m", "turbopi", "infer", "--random-weights", "pi05_tiny", "--help")
     assert "Usage" in text
 
