@@ -87,11 +87,14 @@ def main() -> None:
             contextlib.suppress(KeyboardInterrupt),
         ):
             print(f"warm after {executor.warm_up(arm.observe()):.1f} s")  # the arm stands still here
-            tick = time.monotonic()
-            for _ in range(options.steps):
+            tick, kind = time.monotonic(), ""
+            for step in range(options.steps):
                 if executor.wants_observation:  # the images of other steps wouldn't be used
                     executor.observe(arm.observe())
                 command = executor.next_action()  # never waits for the policy; the log says why there is no action
+                if command.kind != kind:
+                    kind = command.kind
+                    print(f"step {step}: commands are {kind}")
                 if command.action is not None:
                     arm.move(command.action)
                 tick += 1 / options.hz

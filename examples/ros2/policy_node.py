@@ -22,7 +22,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from turbopi.realtime import RealTimeClient, RealTimeExecutor, ServerLost
+from turbopi.realtime import RealTimeClient, RealTimeExecutor
 from turbopi.support.errors import TurboPiError
 
 CHANNELS = {  # of sensor_msgs/Image: bytes of a pixel, and which of them are red, green, blue
@@ -86,17 +86,15 @@ class PolicyNode(Node):  # type: ignore[misc]
         if self.chunks is not None:
             return
         try:
-            policy = RealTimeClient(self.server, connect_s=self.max_age, answer_s=self.max_age)
-        except ServerLost as error:
+            self.chunks = RealTimeExecutor(
+                RealTimeClient(self.server, connect_s=self.max_age, answer_s=self.max_age),
+                control_hz=1 / self.step,
+                execution=self.execution,
+                max_observation_age_s=self.max_age,
+                max_jump=self.max_jump,
+            )  # without hold_action: the trajectory controller holds the last point
+        except TurboPiError as error:
             self._complain(str(error))
-            return
-        self.chunks = RealTimeExecutor(
-            policy,
-            control_hz=1 / self.step,
-            execution=self.execution,
-            max_observation_age_s=self.max_age,
-            max_jump=self.max_jump,
-        )  # without hold_action: the trajectory controller holds the last point
 
     def _take_image(self, key: str, image: Image) -> None:
         self.images[key] = image, self._taken_at(image.header.stamp)
@@ -142,6 +140,8 @@ class PolicyNode(Node):  # type: ignore[misc]
             return
         if command.kind != self.kind:
             self.kind = command.kind
+            if self.kind == "fresh":
+                self.complaint = ""  # the same one later is news
             self.get_logger().info(f"commands are {command.kind}")
         if command.kind != "fresh" and executor.last_error is not None:
             self._complain(str(executor.last_error))
