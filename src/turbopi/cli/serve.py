@@ -150,7 +150,7 @@ def serve(
             "--record-images",
             metavar="exact|png|jpeg",
             rich_help_panel=_RECORDING,
-            help="png: the same pixels, smaller; jpeg: a tenth of the size, pixels nearly the same.",
+            help="png: the same pixels, smaller; jpeg: far smaller, pixels nearly the same.",
         ),
     ] = ServerOptions.record_images,
     page: Annotated[

@@ -57,8 +57,8 @@ class RecordedCall:
 def save_call(path: Path, call: RecordedCall, images: RecordImages = "exact") -> None:
     """Write `call`, whole or not at all. Raises OutputError, and ObservationError for what can't be stored.
 
-    images  how the observation's are written: as they are, "png" (the same pixels, smaller and slower), or "jpeg" (a
-            tenth of the size, pixels nearly the same)
+    images  how the observation's are written: as they are, "png" (the same pixels, smaller and slower), or "jpeg" (far
+            smaller, pixels nearly the same)
     """
     members: dict[str, np.ndarray] = {}
     observation = _to_node(call.observation, "observation", members, images)
