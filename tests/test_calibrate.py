@@ -51,7 +51,7 @@ from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 pytestmark = pytest.mark.usefixtures("two_layers")
 
-TINY = TWO_LAYERS.model
+TINY = TWO_LAYERS.planned_model
 
 
 @lru_cache
@@ -604,12 +604,14 @@ def test_a_file_keeps_its_identity(tmp_path: Path) -> None:
 def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
     calibration = golden_calibration(golden_folder(), "pi0", torch.device("cpu"), 0.0)
     assert calibration.report["observations"]["source"] == "the golden cases themselves"
-    calibration.check(golden_folder().checkpoint("pi0").config.model, golden_folder().checkpoint("pi0").fingerprint())
+    calibration.check(
+        golden_folder().checkpoint("pi0").config.planned_model, golden_folder().checkpoint("pi0").fingerprint()
+    )
     case = golden_cases()["p0_pi0_state"]
     checkpoint = golden_folder().checkpoint("pi0")
     runner = backends.create(
         "pytorch",
-        checkpoint.config.model,
+        checkpoint.config.planned_model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=torch.device("cpu"),
         precision="bf16",

@@ -105,7 +105,7 @@ def _model(options: RobotOptions, checkpoint: str | None) -> ModelConfig:
     """The sizes of the weights that were named; of Pi0.5 if none were. No weight is loaded."""
     if checkpoint is None and options.random_weights is None:
         return ModelConfig()
-    return options.open(checkpoint).config.model
+    return options.open(checkpoint).config.planned_model
 
 
 def _joins(text: str) -> "list[Join]":

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 PART_NAMES = {
     "vision": "vision tower (SigLIP)",
     "projector": "projector",
-    "vlm": "language model (PaliGemma)",
+    "vlm": "language model",
     "expert": "action expert",
     "action_time": "action, state and time projections",
 }
@@ -195,7 +195,7 @@ def _statistics_source(info: dict[str, Any]) -> str:
 
 
 def _state_input(info: dict[str, Any]) -> str:
-    if FAMILIES[info["kind"]].state_token:
+    if FAMILIES[info["kind"]].reads_state:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
 

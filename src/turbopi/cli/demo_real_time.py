@@ -44,7 +44,7 @@ def show_real_time(
     policy = options.make_policy(opened, output)
     policy.warmup()
     source, count = LocalPolicy(policy), EPISODES if episodes is None else episodes
-    px = policy.config.model.vision.image_size
+    px = policy.config.model.image_size
     cells = [(WAYS[0], 0), *((way, DELAY) for way in WAYS)]
     played = []
     with Progress(console=new_console(stderr=True), disable=not output.shows_progress) as bar:

@@ -23,7 +23,7 @@ from turbopi.support.files import write_whole
 if TYPE_CHECKING:
     import numpy as np
 
-    from turbopi.config import ModelConfig
+    from turbopi.config import Network
     from turbopi.policy.policy import UnifiedPolicy
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
@@ -206,7 +206,7 @@ def _sources(path: Path, call: int | None) -> list[Path]:
 
 
 def _noise(
-    model: "ModelConfig", given: "np.ndarray | None", seed: int | None, output: Output
+    model: "Network", given: "np.ndarray | None", seed: int | None, output: Output
 ) -> Callable[[int], "np.ndarray"]:
     """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
     import numpy as np

@@ -83,7 +83,8 @@ class WeightOptions:
             "--random-weights",
             panel=_WEIGHTS,
             metavar="PRESET",
-            help=f"Random weights instead of a checkpoint: {', '.join(PRESETS)}. Their actions mean nothing.",
+            help=f"Random weights instead of a checkpoint: {', '.join(PRESETS)} or smolvla_base. Their actions mean "
+            "nothing.",
         ),
     ] = None
     weights_seed: Annotated[

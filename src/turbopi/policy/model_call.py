@@ -46,7 +46,7 @@ class ModelCall:
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
     ) -> Ran:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        if self._backend.runs_batches:
+        if self._backend.begins:
             return self._begin(observations, joins, noise)
         prepared = [self._pipeline.before(obs) for obs in observations]
         inputs, states = Observation.stack([one for one, _ in prepared]), [state for _, state in prepared]

@@ -18,6 +18,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig, Solver, TimeGrid
+from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.reference import FloatPrecision
@@ -35,7 +36,7 @@ from turbopi.policy.call_options import (
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.model_call import ModelCall
 from turbopi.preprocess.pipeline import Pipeline
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.robots import Robot
@@ -45,7 +46,9 @@ logger = logging.getLogger(__name__)
 
 
 class UnifiedPolicy:
-    """A Pi0.5 or Pi0 policy over any backend: observation in, action chunk out, as openpi computes it.
+    """A policy over any backend: observation in, action chunk out, as its owner's code computes it.
+
+    Pi0.5 and Pi0 as openpi and LeRobot, SmolVLA as LeRobot.
 
         policy = UnifiedPolicy("checkpoints/pi05_libero", config="pi05_libero")
         actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
@@ -63,7 +66,7 @@ class UnifiedPolicy:
             which determine the number of steps. None: the config's.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
-            the checkpoint folder or in openpi's cache.
+            the checkpoint folder or in openpi's cache; SmolVLA's in the folder or the Hub's cache (tokenizer.json).
         default_prompt: for observations without a prompt.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
@@ -95,23 +98,17 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         self._device = backends.resolve_device(device)
-        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
-        backends.check(name, self._device, precision)  # before a calibration is asked for, and weights are read
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
+        backends.check(name, self._device, precision)  # before a calibration is looked for, and weights are read
 
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
-        if checkpoint.format == "random" and tokenizer is None:
-            tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
-        self.config = checkpoint.config
+        self.config, model = checkpoint.config, checkpoint.config.model
+        if backend == "auto" and not family_of(model).planned:
+            name, why = backends.choose(self._device, precision, model)
         self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
-        prompt_tokenizer = load_tokenizer(
-            tokenizer,
-            checkpoint_dir=checkpoint.path,
-            named=checkpoint.named_tokenizer,
-            candidates=checkpoint.tokenizer_candidates,
-            vocab_size=checkpoint.config.model.vocab_size,
-        )
+        prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
         of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes
         for note in (*of_weights, *self._pipeline.notes):
@@ -127,7 +124,7 @@ class UnifiedPolicy:
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
-                name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
+                name, model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
