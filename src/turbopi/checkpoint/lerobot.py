@@ -175,7 +175,7 @@ class LeRobotFolder:
         if not isinstance(kind, str) or kind not in FAMILIES:
             raise CheckpointError(
                 f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's "
-                f"{', '.join(map(repr, FAMILIES))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
+                f"{' and '.join(map(repr, FAMILIES))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
             )
         family = FAMILIES[kind]
         self._check_family(family)

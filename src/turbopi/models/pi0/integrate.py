@@ -81,9 +81,9 @@ def integrate(
 
     Raises ObservationError for a conditioning that doesn't fit.
     """
-    horizon, asked = noise.shape[1], requested or Conditioning()
-    asked.check(num_steps, horizon, noise.shape[2])
-    tokens, guidance = asked.token_times(num_steps, horizon, grid), asked.guidance
+    horizon, wanted = noise.shape[1], requested or Conditioning()
+    wanted.check(num_steps, horizon, noise.shape[2])
+    tokens, guidance = wanted.token_times(num_steps, horizon, grid), wanted.guidance
     distinct = tokens.distinct()
     rows = tokens.rows(distinct)
     conds = embed_times(distinct)
@@ -91,10 +91,10 @@ def integrate(
     def on_device(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(noise.device)
 
-    solver = None if asked.integration is None or asked.integration.is_euler else asked.integration
+    solver = None if wanted.integration is None or wanted.integration.is_euler else wanted.integration
     x_t, evaluations = noise, []
-    if asked.held is not None and asked.values is not None:
-        x_t = torch.where(on_device(asked.held)[:, None], on_device(asked.values), noise)
+    if wanted.held is not None and wanted.values is not None:
+        x_t = torch.where(on_device(wanted.held)[:, None], on_device(wanted.values), noise)
     by_row = on_device(rows)
     times, dt = on_device(tokens.times)[..., None], on_device(tokens.steps)[..., None]  # [N, H, 1]
     for i in range(num_steps):
