@@ -1,4 +1,4 @@
-"""The wheel has everything that the package needs, and works outside a checkout; what importing it does."""
+"""The wheel has everything that the package needs, and works outside a checkout; what importing it does; size of a clone."""
 
 import os
 import re
@@ -15,6 +15,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "turbopi"
+OTHER_FAMILIES = ("tests/golden_pi0_fast/", "tests/golden_smolvla/")
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +37,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert built.returncode == 0, built.stderr
     (file,) = folder.glob("*.whl")
     return file
+
+
+def test_a_clone_stays_small() -> None:
+    """24 MiB of tracked files, and 4 for golden cases of other families than Pi0 and Pi0.5."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    sizes = {name: (ROOT / name).stat().st_size for name in listed.stdout.split("\0") if (ROOT / name).is_file()}
+    families = sum(size for name, size in sizes.items() if name.startswith(OTHER_FAMILIES))
+    largest = sorted(sizes.items(), key=lambda item: -item[1])[:5]
+    assert families <= 4 * 2**20 and sum(sizes.values()) - families <= 24 * 2**20, largest
 
 
 @pytest.mark.slow
