@@ -20,7 +20,7 @@ WEIGHTS = "model.safetensors"
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A checkpoint whose files have been as they are for a minute, and an empty cache."""
     monkeypatch.setattr(known_hashes, "cache_folder", lambda: tmp_path / "cache" / "turbopi")
-    copied = convert(SMALL_POLICY, tmp_path / "checkpoint")
+    copied = convert(SMALL_POLICY, tmp_path / "checkpoint", precision="bf16")
     settle(copied / WEIGHTS, 60)
     return copied
 

@@ -40,7 +40,7 @@ def unpackings(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 @pytest.mark.parametrize("policy", [SMALL_POLICY, CHASE_POLICY], ids=lambda policy: policy.name)
 def test_convert_gives_a_shipped_policy_in_openpis_layout(policy: Path, tmp_path: Path) -> None:
-    content = (convert(policy, tmp_path / "plain") / WEIGHTS).read_bytes()
+    content = (convert(policy, tmp_path / "plain", precision="bf16") / WEIGHTS).read_bytes()
     assert content == lzma.decompress((policy / PACKED).read_bytes())
     assert open_checkpoint(tmp_path / "plain").fingerprint() == open_checkpoint(policy).fingerprint()
 
@@ -121,7 +121,7 @@ def damaged(content: bytes) -> dict[str, tuple[str, bytes | None, str]]:
     return {
         "a byte": (PACKED, content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :], "is damaged"),
         "the end": (PACKED, content[:-5000], "ends early"),
-        "no xz": (PACKED, b"PK\x03\x04 a zip", r"can't be unpacked \(.*damaged"),
+        "no xz": (PACKED, b"PK\x03\x04, as archives of another kind begin", r"can't be unpacked \(.*damaged"),
         "others' weights": (PACKED, lzma.compress(b"weights"), f"doesn't hold what {CHECKSUM} beside it says"),
         "a pointer": (PACKED, b"version https://git-lfs.github.com/spec/v1\noid", "is a Git-LFS pointer"),
         "no checksum": (CHECKSUM, None, f"{CHECKSUM} can't be read: No such file or directory; it belongs to {PACKED}"),
