@@ -1,4 +1,4 @@
-"""The wheel has everything that the package needs, and works outside a checkout; what importing it does; size of a clone."""
+"""The wheel has every file and works outside a checkout; what importing it does; a clone's size."""
 
 import os
 import re
