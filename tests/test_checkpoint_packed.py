@@ -34,7 +34,12 @@ def unpackings(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The files that were unpacked."""
     found: list[Path] = []
     unpack = packed._unpack
-    monkeypatch.setattr(packed, "_unpack", lambda file: (found.append(file), unpack(file))[1])
+
+    def counted(file: Path) -> bytes:
+        found.append(file)
+        return unpack(file)
+
+    monkeypatch.setattr(packed, "_unpack", counted)
     return found
 
 
