@@ -1,7 +1,7 @@
 """The command line.
 
-turbopi demo | infer | serve | view | bench | plan | calibrate | verify | eval |
-    compare | inspect | convert | export | build | tune | backends | doctor
+turbopi demo | infer | serve | view | replay | bench | plan | calibrate | verify |
+    eval | compare | inspect | convert | export | build | tune | backends | doctor
 """
 
 from importlib import metadata
@@ -16,6 +16,7 @@ from turbopi.cli import (  # noqa: F401
     infer,
     serve,
     view,
+    replay,
     bench,
     plan,
     calibrate,
