@@ -145,7 +145,7 @@ def _write_v3(folder: Path, episodes: Sequence[Recorded], tasks: Sequence[str], 
             write_video(folder / f"videos/{key}/chunk-000/file-{file:03d}.mp4", images, info["fps"])
     of_episodes = {key: [line[key] for line in lines] for key in lines[0]}
     _write_parquet(folder / "meta/episodes/chunk-000/file-000.parquet", of_episodes)
-    of_tasks = {"task_index": list(range(len(tasks))), "task": list(tasks)}
+    of_tasks: dict[str, list[Any]] = {"task_index": list(range(len(tasks))), "task": list(tasks)}
     _write_parquet(folder / "meta/tasks.parquet", of_tasks, index="task")  # pandas' index, as LeRobot stores it
     _write_json(folder / "meta/stats.json", _stats(episodes))
 

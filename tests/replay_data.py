@@ -9,6 +9,8 @@ from turbopi.policy.shipped import load_frames
 
 BASE, WRIST, STATE, ACTION = "observation.images.image", "observation.images.wrist_image", "observation.state", "action"
 
+EVERY = 10  # steps of an episode: its first alone has the observation of its images
+
 
 def recorded_frames(swap: bool = False, degrees: bool = False) -> list[Recorded]:
     """Episodes of ten steps; only the first one's observation is a real one, so they are replayed with `--every 10`."""

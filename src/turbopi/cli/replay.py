@@ -147,7 +147,7 @@ def replay_command(
     selected = chosen_episodes(data, wanted)
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
-    second = _second(against, against_config, options, opened, checkpoint)
+    second = _second(against, against_config, options, opened)
     settings = Settings({key: name for key, name in renames.items() if key != ACTIONS}, task, seed, changed)
     document = _run(options, opened, second, data, selected, every, settings, report, output)
     _show(document, output)
@@ -171,20 +171,19 @@ def parse_numbers(text: str) -> list[int]:
     return found
 
 
-def _second(
-    text: str | None, config: str | None, options: PolicyOptions, opened: "Checkpoint", checkpoint: str | None
-) -> "Second | None":
+def _second(text: str | None, config: str | None, options: PolicyOptions, opened: "Checkpoint") -> "Second | None":
     """What --against names. Raises ConfigError."""
     if text is None:
         if config is not None:
             raise ConfigError("--against-config is for the checkpoint of --against, which wasn't given")
         return None
     from turbopi import backends
-    from turbopi.replay.report import Second
+    from turbopi.replay.report import Second, name_of
 
     if Path(text).exists():
         own = replace(options, random_weights=None, weights_seed=None, config=config or options.config)
-        return Second(own, own.open(text), Path(text).name)
+        other = own.open(text)
+        return Second(own, other, name_of(other))
     if config is not None:
         raise ConfigError(f"--against-config is for a checkpoint, and --against {text} is none")
     backend, precision, steps = way_to_run(text, options, "a checkpoint's folder")
@@ -230,7 +229,7 @@ def _run(
         f"{data.path}: {data.kind}; {selection.count} of {selection.of_moments:,} moments, every {selection.every} of "
         f"{len(selection.episodes)} of {selection.of_episodes} episodes, {seconds * 1e3:.0f} ms each"
     )
-    report = Report(data, selection, settings, first, run(first, selection), None if second is None else opened)
+    report = Report(data, selection, settings, first, run(first, selection), opened)
     if second is not None:
         del first
         gc.collect()  # its weights make room for the other's

@@ -123,7 +123,7 @@ def names_of(one: Compared, action_names: Sequence[str] | None) -> list[tuple[st
     return [named[index] for index in range(dims)]
 
 
-def policy_document(one: Compared, action_names: Sequence[str] | None) -> PolicyDocument:
+def policy_document(one: Compared, checkpoint: str, action_names: Sequence[str] | None) -> PolicyDocument:
     run = one.run
     horizon = int(np.isfinite(run.recorded).any(axis=(0, 2)).sum())  # indices that something was recorded of
     joints = []
@@ -144,6 +144,7 @@ def policy_document(one: Compared, action_names: Sequence[str] | None) -> Policy
         )
     return PolicyDocument(
         one.label,
+        checkpoint,
         run.about,
         dict(run.keys.joined),
         spread(one.relative),

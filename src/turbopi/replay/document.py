@@ -71,6 +71,7 @@ class PolicyDocument(Struct, frozen=True):
     """A policy's errors over the moments."""
 
     label: str
+    checkpoint: str
     policy: Mapping[str, object]
     keys: Mapping[str, str]  # robot's key -> the dataset's
     relative: Spread

@@ -9,7 +9,7 @@ from typing import Any
 from turbopi.evaluate.pages import render
 from turbopi.replay import plots
 from turbopi.replay.compare import Compared, names_of
-from turbopi.replay.document import Changed, Joint, ReplayDocument, Spread, State
+from turbopi.replay.document import Changed, Joint, PolicyDocument, ReplayDocument, Spread, State
 from turbopi.support.files import write_whole
 from turbopi.support.reading import plain_document
 from turbopi.support.text import significant
@@ -69,12 +69,13 @@ def _page(document: ReplayDocument, episode: str) -> str:
         against=None if document.against is None else against_text(document),
         episode=episode,
         keys=sorted(first.keys.items()),
-        settings=[
-            (policy.label, sorted((key, str(value)) for key, value in policy.policy.items()))
-            for policy in document.policies
-        ],
+        settings=[(policy.label, _settings(policy)) for policy in document.policies],
         seed=document.seed,
     )
+
+
+def _settings(policy: PolicyDocument) -> list[tuple[str, str]]:
+    return [("checkpoint", policy.checkpoint), *((key, str(value)) for key, value in policy.policy.items())]
 
 
 def _cards(document: ReplayDocument) -> list[tuple[str, str, str]]:

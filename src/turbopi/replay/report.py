@@ -41,11 +41,17 @@ class Second:
     label: str
 
 
-class Report:
-    """Made after the first policy has run, as long as it is there; a second one may be added.
+def name_of(checkpoint: Checkpoint) -> str:
+    """Its folder's name."""
+    return "random weights" if checkpoint.path is None else checkpoint.path.resolve().name
 
-    shared   the checkpoint, if a second policy comes
-    """
+
+def _way(run: Replayed) -> str:
+    return f"{run.about['backend']} {run.about['precision']}"
+
+
+class Report:
+    """Made after the first policy has run, as long as it is there; a second one may be added."""
 
     def __init__(
         self,
@@ -54,11 +60,12 @@ class Report:
         settings: Settings,
         replay: Replay,
         run: Replayed,
-        shared: Checkpoint | None,
+        checkpoint: Checkpoint,
     ) -> None:
-        self._dataset, self._selection, self._settings, self._shared = dataset, selection, settings, shared
+        self._dataset, self._selection, self._settings = dataset, selection, settings
+        self._checkpoints = [checkpoint]
         self._device = torch.device(str(run.about["device"]))
-        self._compared = [compared("the policy", run)]
+        self._compared = [compared(f"{name_of(checkpoint)}, {_way(run)}", run)]
         self._rows = worst_moments(self._compared[0], WORST)
         self._observations = [replay.observation_at(*run.moments[row]) for row in self._rows]
         self._prompt_key = run.keys.prompt
@@ -72,24 +79,27 @@ class Report:
                 f"--against {second.label} has {run.predicted.shape[2]} actions a step, the first policy "
                 f"{first.run.predicted.shape[2]}: there is nothing to compare"
             )
-        assert self._shared is not None
-        about = first.run.about
-        same = second.checkpoint is self._shared
-        own = (
-            f"{about['backend']} {about['precision']}" if same or self._shared.path is None else self._shared.path.name
-        )
-        self._compared = [compared(own, first.run), compared(second.label, run, first.run.units)]
+        own = self._checkpoints[0]
+        label = _way(first.run) if second.checkpoint is own else name_of(own)
+        if label == second.label:
+            label = str(own.path)
+        self._compared = [compared(label, first.run), compared(second.label, run, first.run.units)]
+        self._checkpoints.append(second.checkpoint)
 
     def write(self, folder: Path) -> ReplayDocument:
         """Write the report; returns its document."""
-        document = self._document()
+        document = self.document()
         material = Material(self._compared, self._rows, self._observations, self._dataset.action_names)
         write_report(folder, document, material)
         return document
 
-    def _document(self) -> ReplayDocument:
+    def document(self) -> ReplayDocument:
+        """What was found."""
         first, dataset, selection = self._compared[0], self._dataset, self._selection
-        policies = [policy_document(one, dataset.action_names) for one in self._compared]
+        policies = [
+            policy_document(one, str(checkpoint.path or "random weights"), dataset.action_names)
+            for one, checkpoint in zip(self._compared, self._checkpoints, strict=True)
+        ]
         beside = controls(first)
         states = state_documents(first.run, None)
         prompts = [self._prompt(observation) for observation in self._observations]

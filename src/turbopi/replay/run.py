@@ -135,7 +135,7 @@ class Replay:
         self._first = self._read_first(episodes[0])
         self.keys = join_keys(policy, self._first.observation, settings.renames, settings.task)
         self.width = self._check_width(self._first.recorded.shape[1])
-        self.variations = _variations(self.keys) if settings.changed else []
+        self.variations = variations_of(self.keys) if settings.changed else []
 
     def _read_first(self, episode: Episode) -> Moment:
         begin = time.perf_counter()
@@ -285,7 +285,7 @@ def _batches(moments: Iterator[Moment], size: int) -> Iterator[list[Moment]]:
         yield batch
 
 
-def _variations(keys: KeyMap) -> list[Variation]:
+def variations_of(keys: KeyMap) -> list[Variation]:
     """Mistakes that are easily made with cameras: exchanged, BGR for RGB, turned."""
 
     def of_all(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
