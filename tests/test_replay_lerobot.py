@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from checkpoint_helpers import lerobot_copy, write_json
 from cli_helpers import turbopi
 from lerobot_datasets import Recorded, write_dataset
 from replay_data import EVERY, write_frames
 
+from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.replay.document import ReplayDocument
 from turbopi.replay.lerobot_dataset import LeRobotDataset
 from turbopi.replay.opening import open_dataset
 from turbopi.replay.page import DOCUMENT
+from turbopi.replay.run import Replay, Settings, select
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.reading import read_document
 
@@ -100,6 +103,30 @@ def test_the_small_policy_is_right_on_its_frames_as_a_dataset(tmp_path: Path, ve
     assert "key: observation.images.wrist_image -> observation/wrist_image" in ran.output
     written = read_document(report / DOCUMENT, ReplayDocument)
     assert written.verdict.level == "follows" and written.dataset.fps == 10
+
+
+class Letters:
+    """A tokenizer: a token a letter."""
+
+    def encode(self, text: str, add_bos: bool) -> list[int]:
+        return [2, *(ord(letter) % 500 for letter in text)]
+
+
+def test_a_lerobot_checkpoints_keys_fit_as_they_are(tmp_path: Path) -> None:
+    """A third camera isn't read, which is noted."""
+    count, image = 12, np.zeros((12, 32, 32, 3), np.uint8)
+    images = {f"observation.images.{name}": image for name in ("image", "image2", "side")}
+    random = np.random.default_rng(0)
+    numbers = {"observation.state": random.standard_normal((count, 8)), "action": random.standard_normal((count, 7))}
+    data = open_dataset(write_dataset(tmp_path / "data", [Recorded("tidy up", images, numbers)]))
+    checkpoint = lerobot_copy(tmp_path / "checkpoint")
+    write_json(checkpoint / "turbopi.json", {"vision_heads": 4})
+    policy = UnifiedPolicy(checkpoint, device="cpu", precision="f32", tokenizer=Letters())
+    replay = Replay(policy, data, data.episodes, Settings({}, changed=0))
+    assert replay.keys.described == [] and replay.keys.prompt == "task"
+    assert replay.notes == ["cameras of the dataset that the policy doesn't read: observation.images.side"]
+    found = replay.run(select(data.episodes, 6, 1), lambda: None)
+    assert found.predicted.shape == (2, 30, 7) and np.isfinite(found.recorded[1]).sum() == 6 * 7
 
 
 # --- what isn't as info.json says -------------------------------------------------------------------------------------

@@ -99,9 +99,8 @@ def replay_command(
         typer.Option(
             "--rename",
             metavar="KEY=KEY",
-            help="The dataset's key and the robot's, such as observation.images.top=observation/image; may be "
-            "repeated. "
-            "The recorded actions are called `actions`.",
+            help="The dataset's key and the robot's, such as top=observation/image; may be repeated. The recorded "
+            "actions are called `actions`.",
         ),
     ] = None,
     changed: Annotated[
