@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +152,24 @@ def test_images_changed_on_purpose() -> None:
         np.testing.assert_array_equal(found[name]["top"], change)
         np.testing.assert_array_equal(found[name]["side"], change.transpose(2, 0, 1))
         assert found[name]["state"] is given["state"]
+
+
+def test_batches_change_nothing(
+    policy: UnifiedPolicy, replayed: Callable[..., ReplayDocument], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A backend that runs several observations together gets them so, each with the noise that it has alone."""
+    path, sizes = write_npz(tmp_path / "data"), []
+
+    def infer_batch(observations: Sequence[Mapping[str, Any]], *, seed: Sequence[int]) -> list[dict[str, Any]]:
+        sizes.append(len(observations))
+        return [policy.infer(one, seed=own) for one, own in zip(observations, seed, strict=True)]
+
+    alone = replayed(path)
+    monkeypatch.setattr(UnifiedPolicy, "runs_batches", True)
+    monkeypatch.setattr(policy, "infer_batch", infer_batch)
+    together = replayed(path)
+    assert sizes == [6]
+    assert together.policies[0].joints == alone.policies[0].joints and together.worst == alone.worst
 
 
 # --- which moments ----------------------------------------------------------------------------------------------------
