@@ -19,7 +19,7 @@ from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.replay import compare
-from turbopi.replay.document import ReplayDocument
+from turbopi.replay.document import Control, ReplayDocument, Verdict
 from turbopi.replay.episodes import Episode
 from turbopi.replay.judge import judge
 from turbopi.replay.keys import KeyMap
@@ -94,20 +94,27 @@ def test_degrees_for_radians_are_named(replayed: Callable[..., ReplayDocument], 
     assert any(state.outside for state in document.states)
 
 
-def hints_of(change: Callable[[np.ndarray], np.ndarray], reach: float = 1.0) -> list[str]:
-    """What is said where `change` of four independent predicted actions was recorded."""
+def judged(
+    change: Callable[[np.ndarray], np.ndarray], reach: float = 1.0, state: float = 0.0, held: float | None = None
+) -> Verdict:
+    """What is said where `change` of four independent predicted actions was recorded.
+
+    state   how widely the state ranges that both are relative to
+    held    the error of the action before, held; None: it isn't known
+    """
     random = np.random.default_rng(1)
     predicted = random.uniform(-0.9, 0.9, (40, 6, 4))
     recorded = change(predicted + random.normal(0, 0.02, predicted.shape))
+    middle = state * random.standard_normal((40, 4))
     run = Replayed(
         about={"robot": "arm", "random_weights": False},
         keys=KeyMap({}, (), frozenset(), "prompt", (), ()),
         moments=[(Episode(number // 8, 80, str(number // 8)), number % 8 * 10) for number in range(40)],
-        predicted=predicted,
-        recorded=recorded,
+        predicted=predicted + middle[:, None],
+        recorded=recorded + middle[:, None],
         previous=np.full((40, 4), np.nan),
         units=np.full(4, reach),
-        middle=np.zeros((40, 4)),
+        middle=middle,
         states=np.zeros((40, 3)),
         state_scale=Normalizer("identity", None, "state"),
         reach=1.0,
@@ -117,7 +124,12 @@ def hints_of(change: Callable[[np.ndarray], np.ndarray], reach: float = 1.0) -> 
     )
     one = compare.compared("the policy", run)
     document = compare.policy_document(one, "here", ("a", "b", "c", "d"))
-    verdict = judge(one, document, compare.controls(one), compare.state_documents(run, None), "tidy up")
+    beside = [*compare.controls(one), *([] if held is None else [Control(compare.HELD, held, [])])]
+    return judge(one, document, beside, compare.state_documents(run, None), "tidy up")
+
+
+def hints_of(change: Callable[[np.ndarray], np.ndarray], reach: float = 1.0, state: float = 0.0) -> list[str]:
+    verdict = judged(change, reach, state)
     assert (verdict.level == "follows") == (not verdict.hints)
     return verdict.hints
 
@@ -135,6 +147,20 @@ def test_what_the_actions_show_is_named() -> None:
     assert "outside of the checkpoint's statistics (4 of 4 dimensions" in other
     (nothing,) = hints_of(lambda actions: np.random.default_rng(2).uniform(-1, 1, actions.shape))
     assert "Nothing in the numbers shows why" in nothing and "“tidy up”" in nothing
+
+
+def test_a_policy_that_standing_still_beats_follows_in_part() -> None:
+    right = judged(lambda actions: actions, held=0.1)
+    assert right.level == "follows" and "0.100 of the action before, held" in right.text
+    assert judged(lambda actions: actions, held=0.001).level == "partly"
+
+
+def test_relative_actions_are_judged_by_their_motion() -> None:
+    """The state is in every chunk of such a policy: what it adds to that decides."""
+    assert hints_of(lambda actions: actions, state=50.0) == []
+    assert "against each other in a, b, c, d" in hints_of(lambda actions: -actions, state=50.0)[0]
+    (nothing,) = hints_of(lambda actions: np.random.default_rng(2).uniform(-1, 1, actions.shape), state=50.0)
+    assert "Nothing in the numbers shows why" in nothing
 
 
 def test_images_changed_on_purpose() -> None:
@@ -263,14 +289,15 @@ def written(folder: Path, **arrays: np.ndarray) -> Path:
     return folder
 
 
-def steps(count: int = 3, **others: np.ndarray) -> dict[str, np.ndarray]:
-    images = np.zeros((count, 8, 8, 3), np.uint8)
+def steps(**others: np.ndarray) -> dict[str, np.ndarray]:
+    """An episode of three, with other arrays."""
+    images = np.zeros((3, 8, 8, 3), np.uint8)
     found: dict[str, np.ndarray] = {
         "observation/image": images,
         "observation/wrist_image": images,
-        "observation/state": np.zeros((count, 8)),
+        "observation/state": np.zeros((3, 8)),
     }
-    return {**found, "actions": np.zeros((count, 7)), "prompt": np.array("tidy up")} | others
+    return {**found, "actions": np.zeros((3, 7)), "prompt": np.array("tidy up")} | others
 
 
 def test_keys_that_fit_nowhere_are_named_with_what_to_do(policy: UnifiedPolicy, tmp_path: Path) -> None:
@@ -291,10 +318,16 @@ def test_keys_that_fit_nowhere_are_named_with_what_to_do(policy: UnifiedPolicy, 
         "cameras/wrist_image -> observation/wrist_image",
         "qpos -> observation/state",
     ]
+    assert ready(path, {"observation/image": "top"}).keys == made.keys
     with pytest.raises(ConfigError, match="the dataset has no front; it has"):
         ready(path, {"observation/image": "front"})
     with pytest.raises(ConfigError, match="robot libero has no front; it has"):
         ready(path, {"front": "cameras/top"})
+    state = np.zeros((3, 8))
+    state[2, 1] = np.nan
+    last = ready(written(tmp_path / "nan", **steps(**{"observation/state": state})), {})
+    with pytest.raises(ObservationError, match="episode episode, step 2: observation/state isn't finite: value 1"):
+        last.run(select(last.dataset.episodes, 2, 1), lambda: None)
     with pytest.raises(ConfigError, match="6 actions a step, but robot libero has 7"):
         ready(written(tmp_path / "six", **steps(actions=np.zeros((3, 6)))), {})
 

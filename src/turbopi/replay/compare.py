@@ -72,21 +72,23 @@ def spread(values: np.ndarray) -> Spread:
 
 
 def controls(one: Compared) -> list[Control]:
-    """What a chunk for another moment, a constant, and standing still are wrong by. Those that can't be had are left
-    out: one moment has no other, a recording of calls has no action before.
+    """What a chunk for another moment, a constant, and the action before are wrong by. For relative actions the first
+    two start from the moment's own state. Those that can't be had are left out: one moment has no other, a recording of
+    calls has no action before.
     """
-    recorded, run = one.run.recorded, one.run
+    run = one.run
+    predicted, recorded = run.moved
     count = len(recorded)
     found: list[Control] = []
     if count > 1:
         draws = np.random.default_rng(0)
         pairs = [(np.arange(count) + draws.integers(1, count, count)) % count for _ in range(OTHER_MOMENTS)]
-        errors = np.stack([np.abs(run.predicted[pair] - recorded) for pair in pairs])  # [draws, N, H, d]
+        errors = np.stack([np.abs(predicted[pair] - recorded) for pair in pairs])  # [draws, N, H, d]
         found.append(_control(OTHERS, relative(errors, one.units)))
         constant = mean(recorded, (0, 1))
         found.append(_control(MEAN, relative(np.abs(constant - recorded), one.units)))
     if np.isfinite(run.previous).any():
-        found.append(_control(HELD, relative(np.abs(run.previous[:, None] - recorded), one.units)))
+        found.append(_control(HELD, relative(np.abs(run.previous[:, None] - run.recorded), one.units)))
     return found
 
 
@@ -126,6 +128,7 @@ def names_of(one: Compared, action_names: Sequence[str] | None) -> list[tuple[st
 def policy_document(one: Compared, checkpoint: str, action_names: Sequence[str] | None) -> PolicyDocument:
     run = one.run
     horizon = int(np.isfinite(run.recorded).any(axis=(0, 2)).sum())  # indices that something was recorded of
+    predicted, recorded = run.moved
     joints = []
     low, high = run.middle.mean(0) - run.reach * run.units, run.middle.mean(0) + run.reach * run.units
     for index, (name, unit) in enumerate(names_of(one, action_names)):
@@ -137,7 +140,7 @@ def policy_document(one: Compared, checkpoint: str, action_names: Sequence[str] 
                 spread(one.error[..., index]),
                 spread(one.relative[..., index]) if run.units[index] > NEVER_MOVED else None,
                 [spread(one.error[:, k, index]) for k in range(horizon)],
-                correlation(run.predicted[..., index], values),
+                correlation(predicted[..., index], recorded[..., index]),
                 quantiles(values),
                 (float(low[index]), float(high[index])),
             )

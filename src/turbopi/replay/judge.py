@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from turbopi.replay.compare import MEAN, NEVER_MOVED, OTHERS, Compared
+from turbopi.replay.compare import HELD, MEAN, NEVER_MOVED, OTHERS, Compared
 from turbopi.replay.document import Changed, Control, Level, PolicyDocument, State, Verdict
 from turbopi.replay.run import reach_of
 from turbopi.support.text import significant
@@ -23,15 +23,16 @@ def judge(
     one: Compared, document: PolicyDocument, controls: Sequence[Control], states: Sequence[State], prompt: str
 ) -> Verdict:
     """Whether the chunks follow what was recorded, and if not, what shows why."""
-    knowing_nothing = {control.name: control.relative for control in controls if control.name in (OTHERS, MEAN)}
+    values = {control.name: control.relative for control in controls}
+    knowing_nothing = [values[name] for name in (OTHERS, MEAN) if name in values]
     error, moments = document.relative.mean, len(one.by_moment)
     if moments < LEAST or not knowing_nothing:
         text = f"Too few moments to judge: {moments}. Take more episodes, or a smaller --every."
         return Verdict("too few", text, list(_hints(one, document, states, "too few")))
-    lowest = min(knowing_nothing.values())
+    lowest, held = min(knowing_nothing), values.get(HELD, np.inf)
     share = error / lowest if lowest > 0 else np.inf
-    level: Level = "follows" if share <= FOLLOWS else "partly" if share <= PARTLY else "differs"
-    beside = " and ".join(f"{significant(value)} of {name}" for name, value in knowing_nothing.items())
+    level: Level = "differs" if share > PARTLY else "partly" if share > FOLLOWS or error > held else "follows"
+    beside = ", ".join(f"{significant(value)} of {name}" for name, value in values.items())
     opening = {
         "follows": "The chunks follow the recorded actions",
         "partly": "The chunks follow the recorded actions in part",
@@ -147,9 +148,10 @@ def _of_changes(changed: Sequence[Changed]) -> Iterator[str]:
 
 def _of_joints(one: Compared, document: PolicyDocument) -> Iterator[str]:
     """Actions in another order, with another sign, or of another scale: they go together, but not as they should."""
-    run, joints = one.run, document.joints
-    there = np.isfinite(run.recorded).all(2)
-    predicted, recorded = run.predicted[there], run.recorded[there]
+    joints = document.joints
+    predicted, recorded = one.run.moved
+    there = np.isfinite(recorded).all(2)
+    predicted, recorded = predicted[there], recorded[there]
     moving = [i for i, joint in enumerate(joints) if joint.correlation is not None]
     if len(predicted) < 10 or not moving:
         return

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from turbopi.policy.policy import UnifiedPolicy
-from turbopi.replay.episodes import ACTIONS, PROMPT
+from turbopi.replay.episodes import PROMPT
 from turbopi.robots.base import find, keys_of, listed
 from turbopi.support.errors import ConfigError, ObservationError
 
@@ -56,7 +56,9 @@ class KeyMap:
 
 
 def parse_renames(texts: Iterable[str]) -> dict[str, str]:
-    """{robot's key: dataset's} of ["DATASET_KEY=ROBOT_KEY", …]. Raises ConfigError."""
+    """{robot's key: dataset's} of ["DATASET_KEY=ROBOT_KEY", …], the dataset's in full or its last part alone. Raises
+    ConfigError.
+    """
     found: dict[str, str] = {}
     for text in texts:
         source, equals, key = text.partition("=")
@@ -80,13 +82,16 @@ def join_keys(
     keys = [key for key in keys if key != prompt]
     theirs = [key for key in keys_of(recorded) if key not in _PROMPTS]
     cameras = tuple(key for key in keys if np.ndim(find(example, key)) == 3)
-    known = {*keys, ACTIONS, prompt}
+    known = [*keys, prompt]
+    given = dict[str, str]()
     for key, source in renames.items():
         if key not in known:
             raise ConfigError(f"--rename {source}={key}: robot {_robot(policy)} has no {key}; it has {listed(known)}")
-        if key != ACTIONS and source not in theirs:
+        meant = source if source in theirs else _same(source, theirs)
+        if meant is None:
             raise ConfigError(f"--rename {source}={key}: the dataset has no {source}; it has {listed(theirs)}")
-    joined = {key: renames.get(key) or _same(key, theirs) for key in keys}
+        given[key] = meant
+    joined = {key: given.get(key) or _same(key, theirs) for key in keys}
     _join_state(joined, cameras, recorded, theirs)
     taken = {source for source in joined.values() if source is not None}
     unread = tuple(key for key in theirs if key not in taken and _is_image(find(recorded, key)))

@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
 from turbopi.replay.keys import KeyMap, join_keys
-from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 from turbopi.verify.demo import action_units
 
 SECONDS = 60.0  # that a run takes, unless --every says how many moments
@@ -63,6 +64,13 @@ class Replayed:
     call_ms: Sequence[float]
     changed: Sequence[int]
     variations: Mapping[str, np.ndarray]
+
+    @property
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """(predicted, recorded) from the middle on: for relative actions the motion from the state. The state itself is
+        in what any such policy predicts, so it would make a chunk of nonsense look near.
+        """
+        return self.predicted - self.middle[:, None], self.recorded - self.middle[:, None]
 
 
 def reach_of(scale: Normalizer) -> float:
@@ -197,15 +205,16 @@ class Replay:
         for batch in batches:
             observations = [self._observation(moment) for moment in batch]
             seeds = [self.settings.seed + len(found) + row for row in range(len(batch))]
-            begin = time.perf_counter()
-            chunks = self._infer(observations, seeds)
-            call_ms.append((time.perf_counter() - begin) * 1e3)
-            for moment, observation, chunk, seed in zip(batch, observations, chunks, seeds, strict=True):
-                if len(found) in changed:
-                    for variation in self.variations:
-                        varied[variation.name] += self._infer([variation.change(observation)], [seed])
-                found.append(self._answer(moment, observation, chunk))
-                advance()
+            with self._naming(batch):
+                begin = time.perf_counter()
+                chunks = self._infer(observations, seeds)
+                call_ms.append((time.perf_counter() - begin) * 1e3)
+                for moment, observation, chunk, seed in zip(batch, observations, chunks, seeds, strict=True):
+                    if len(found) in changed:
+                        for variation in self.variations:
+                            varied[variation.name] += self._infer([variation.change(observation)], [seed])
+                    found.append(self._answer(moment, observation, chunk))
+                    advance()
         return Replayed(
             self.policy.metadata,
             self.keys,
@@ -227,6 +236,16 @@ class Replay:
         """One moment's observation under the robot's keys, to be looked at."""
         (moment,) = self.dataset.moments(episode, [step], self.horizon)
         return self._observation(moment)
+
+    @contextmanager
+    def _naming(self, batch: Sequence[Moment]) -> Iterator[None]:
+        """What the policy can't use is named with where it is."""
+        try:
+            yield
+        except (ObservationError, ActionError) as error:
+            first, more = batch[0], f" and the {len(batch) - 1} after it" if len(batch) > 1 else ""
+            where = f"{self.dataset.path}: episode {first.episode.name}, step {first.step}{more}"
+            raise type(error)(f"{where}: {error}") from error
 
     def _moments(self, selection: Selection) -> Iterator[Moment]:
         for episode in selection.episodes:
