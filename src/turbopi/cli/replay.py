@@ -111,8 +111,7 @@ def replay_command(
             max=1000,
             metavar="N",
             help="Moments at which inputs are also changed on purpose (cameras exchanged, colours, turned), to find "
-            "such "
-            "a mistake in the data; 0: none.",
+            "such a mistake in the data; 0: none.",
         ),
     ] = 12,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first moment's noise.")] = 0,
@@ -209,8 +208,6 @@ def _run(
         made = Replay(policy, data, episodes, settings)
         for line in made.keys.described:
             output.line(f"key: {line}")
-        for note in made.notes:
-            output.line(f"note: {note}", "yellow")
         return made
 
     def run(made: Replay, selection: "Selection") -> Replayed:
@@ -224,9 +221,11 @@ def _run(
     output.line("Warming up …")
     seconds = first.warm_up()
     selection = select(episodes, every, affordable(seconds, first.changes))
+    rate = "" if data.fps is None else f", {data.fps:g} steps a second: a chunk covers {first.horizon / data.fps:.2g} s"
+    output.line(f"{data.path}: {data.kind}{rate}")
     output.line(
-        f"{data.path}: {data.kind}; {selection.count} of {selection.of_moments:,} moments, every {selection.every} of "
-        f"{len(selection.episodes)} of {selection.of_episodes} episodes, {seconds * 1e3:.0f} ms each"
+        f"{selection.count} of {selection.of_moments:,} moments, every {selection.every} of {len(selection.episodes)} "
+        f"of {selection.of_episodes} episodes, {seconds * 1e3:.0f} ms each"
     )
     report = Report(data, selection, settings, first, run(first, selection), opened)
     if second is not None:
@@ -259,8 +258,7 @@ def _show(document: "ReplayDocument", output: Output) -> None:
         output.table(_table("with inputs changed on purpose", ["inputs", "error", "as recorded", "nearer at"], rows))
     output.line(
         "Errors are absolute differences to what was recorded. relative: in units of the model's normalised actions, "
-        "half "
-        "of what nearly all of the training's actions range over, or one standard deviation.",
+        "half of what nearly all of the training's actions range over, or one standard deviation.",
         "dim",
     )
     for note in document.notes:

@@ -61,8 +61,7 @@ class _EpisodeFiles(Dataset):
             if ACTIONS not in arrays:
                 raise ObservationError(
                     f"{file} has no {self.action}, the recorded actions [T, d]; it has "
-                    f"{listing(list(arrays)) or 'nothing'}. "
-                    "Say which they are: --rename KEY=actions"
+                    f"{listing(list(arrays)) or 'nothing'}. Say which they are: --rename KEY=actions"
                 )
             shape = np.shape(arrays[ACTIONS])
         if not shape or not shape[0]:

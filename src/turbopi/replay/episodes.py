@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ class Dataset(ABC):
     action_names   of each action; None: not known
     notes          what the user had better look at
     caveat         what its recorded actions are, if they aren't what a person or an expert did
+    wanted         keys of images that are read, if that takes long; None: all
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Dataset(ABC):
     fps: float | None = None
     action_names: tuple[str, ...] | None = None
     caveat: str | None = None
+    wanted: frozenset[str] | None = None
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -73,6 +75,10 @@ class Dataset(ABC):
     def observations(self, episode: Episode, steps: Sequence[int]) -> Iterator[dict[str, Any]]:
         """The observations at some steps, which rise. Raises ObservationError."""
         ...
+
+    def names_of(self, key: str) -> tuple[str, ...] | None:
+        """The name of each number of an observation's key; None: not known."""
+        return None
 
     def moments(self, episode: Episode, steps: Sequence[int], horizon: int) -> Iterator[Moment]:
         """The moments at some steps, which rise. Raises ObservationError, naming the file, for what can't be read."""
@@ -108,8 +114,8 @@ class Selection:
 
     episodes: tuple[Episode, ...]
     every: int
-    of_episodes: int = field(default=0)  # that there are
-    of_moments: int = field(default=0)
+    of_episodes: int  # that there are
+    of_moments: int
 
     @property
     def count(self) -> int:

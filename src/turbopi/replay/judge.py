@@ -14,8 +14,7 @@ LEAST = 5  # moments that are judged
 DEGREES = 180 / np.pi
 NO_SUCCESS_RATE = (
     "It isn't a success rate: how often the robot succeeds, only the robot shows. Recorded actions aren't the only "
-    "right "
-    "ones, either."
+    "right ones, either."
 )
 
 
@@ -44,17 +43,16 @@ def judge(
         hints = ["The weights are random: no other result could be expected."]
     elif level == "differs" and not hints:
         hints = [
-            "Nothing in the numbers shows why. Look at, in this order: is it the checkpoint of this task, with its own "
-            "--config and statistics (`turbopi inspect`)? Is each camera the right one (the keys above, --rename)? "
-            "Is the "
-            f"prompt the training's (“{prompt}”, --task)? Are the actions of the same kind: positions or differences, "
-            "joints or end effector?"
+            "Nothing in the numbers shows why. Look at, in this order: is it the checkpoint of this task, with its "
+            "own --config and statistics (`turbopi inspect`)? Is each camera the right one (the keys above, "
+            f"--rename)? Is the prompt the training's (“{prompt}”, --task)? Are the actions of the same kind: "
+            "positions or differences, joints or end effector?"
         ]
     return Verdict(level, text, hints)
 
 
 def _hints(one: Compared, document: PolicyDocument, states: Sequence[State], level: Level) -> Iterator[str]:
-    yield from _of_units(one, states)
+    yield from _of_units(one, states, level in ("partly", "differs"))
     yield from _of_changes(document.changed)
     if level in ("partly", "differs"):
         yield from _of_joints(one, document)
@@ -63,8 +61,10 @@ def _hints(one: Compared, document: PolicyDocument, states: Sequence[State], lev
 # --- units and statistics ---------------------------------------------------------------------------------------------
 
 
-def _of_units(one: Compared, states: Sequence[State]) -> Iterator[str]:
-    """Numbers that the training hadn't: degrees for radians, other statistics."""
+def _of_units(one: Compared, states: Sequence[State], wrong: bool) -> Iterator[str]:
+    """Numbers that the training hadn't: degrees for radians, other statistics; only if the chunks are `wrong` also
+    radians for degrees, as a robot that hardly moves has such numbers, too.
+    """
     run = one.run
     scale = run.state_scale
     if scale.width is not None:
@@ -73,24 +73,24 @@ def _of_units(one: Compared, states: Sequence[State]) -> Iterator[str]:
         moving, middle = (high - low) / 2 > NEVER_MOVED, (high + low) / 2
         half = np.where(moving, (high - low) / 2, 1)
         outside = [state for state in states if state.outside]
-        found = _converted(lambda factor: (factor * run.states - middle) / half, moving)
+        found = _converted(lambda factor: (factor * run.states - middle) / half, moving, wrong)
         if found is not None:
             yield (
-                f"The states look as if they were in {found}. Convert them where they are recorded, or in a robot "
-                "of your own."
+                f"The states look as if they were in {found}. Convert them where they are recorded, or in a robot of "
+                "your own."
             )
         elif outside:
             shown = "; ".join(_range_of(state.name, state.recorded, state.trained) for state in outside[:3])
             more = f"; {len(outside) - 3} more" if len(outside) > 3 else ""
             yield (
-                f"States are outside of the checkpoint's statistics: {shown}{more}. Are these its statistics, and "
-                "is this its robot?"
+                f"States are outside of the checkpoint's statistics: {shown}{more}. Are these its statistics, and is "
+                "this its robot?"
             )
     recorded = run.recorded.reshape(-1, run.recorded.shape[2])
     middle = np.repeat(run.middle, run.recorded.shape[1], 0)
     moving = run.units > NEVER_MOVED
     half = np.where(moving, run.reach * run.units, 1)
-    found = _converted(lambda factor: (factor * recorded - middle) / half, moving)
+    found = _converted(lambda factor: (factor * recorded - middle) / half, moving, wrong)
     if found is not None:
         yield f"The recorded actions look as if they were in {found}."
         return
@@ -99,8 +99,8 @@ def _of_units(one: Compared, states: Sequence[State]) -> Iterator[str]:
     if far:
         yield (
             f"Recorded actions are outside of the checkpoint's statistics ({len(far)} of {int(moving.sum())} "
-            "dimensions, "
-            "the table shows which): its statistics are of other data, or these are actions of another kind or unit."
+            "dimensions, the table shows which): its statistics are of other data, or these are actions of another "
+            "kind or unit."
         )
 
 
@@ -109,16 +109,17 @@ def _range_of(name: str, recorded: tuple[float, float], trained: tuple[float, fl
     return f"{name} {recorded[0]:.3g} to {recorded[1]:.3g}{training}"
 
 
-def _converted(normalised: Callable[[float], np.ndarray], moving: np.ndarray) -> str | None:
+def _converted(normalised: Callable[[float], np.ndarray], moving: np.ndarray, small: bool) -> str | None:
     """ "degrees …" if numbers [n, d] fit the training's range converted, and as they are don't.
 
     normalised   factor -> the numbers times that, of which the training's are in [-1, 1]
+    small        whether radians for degrees are looked for, too
     """
     if not moving.any() or _fits(normalised(1.0)[:, moving]):
         return None
     if _fits(normalised(1 / DEGREES)[:, moving]):
         return "degrees, and the checkpoint was trained on radians"
-    if _fits(normalised(DEGREES)[:, moving]):
+    if small and _fits(normalised(DEGREES)[:, moving]):
         return "radians, and the checkpoint was trained on degrees"
     return None
 
@@ -138,7 +139,7 @@ def _fits(values: np.ndarray) -> bool:
 
 def _of_changes(changed: Sequence[Changed]) -> Iterator[str]:
     for one in changed:
-        if one.moments >= 4 and one.relative < 0.85 * one.as_recorded and one.nearer >= 0.75 * one.moments:
+        if one.moments >= 4 and one.relative < 0.85 * one.as_recorded and one.nearer >= 0.8 * one.moments:
             yield (
                 f"With {one.name} the error falls from {significant(one.as_recorded)} to {significant(one.relative)} "
                 f"(nearer at {one.nearer} of {one.moments} moments): the dataset seems to have them the other way "
@@ -178,6 +179,6 @@ def _of_joints(one: Compared, document: PolicyDocument) -> Iterator[str]:
     ]
     if slopes and 2 * len(slopes) >= len(moving) and not 0.4 < (middle := float(np.median(slopes))) < 2.5:
         yield (
-            f"Recorded actions go with the predicted ones, but are {middle:.3g} times as large: another unit, or "
-            "other statistics?"
+            f"Recorded actions go with the predicted ones, but are {middle:.3g} times as large: another unit, or other "
+            "statistics?"
         )

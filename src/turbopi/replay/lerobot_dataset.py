@@ -79,7 +79,7 @@ class LeRobotDataset(Dataset):
             )
         self._action = found[0]
         self.action_names = self.names_of(self._action)
-        self._check_statistics()
+        self._range = self._read_range()
 
     # Metadata
 
@@ -89,12 +89,12 @@ class LeRobotDataset(Dataset):
             self._info.refuse("features", "an object of objects with dtype and shape")
         return features
 
-    def names_of(self, feature: str) -> tuple[str, ...] | None:
-        """The name of each number of a feature, where info.json has them: a list, or lists by group."""
-        named = self._features.get(feature, {}).get("names")
+    def names_of(self, key: str) -> tuple[str, ...] | None:
+        """As info.json has them: a list, or lists by group."""
+        named = self._features.get(key, {}).get("names")
         if isinstance(named, Mapping):
             named = [name for group in named.values() if isinstance(group, list) for name in group]
-        width = self._width(feature)
+        width = self._width(key)
         if isinstance(named, list) and len(named) == width and all(isinstance(one, str) for one in named):
             return tuple(named)
         return None
@@ -104,9 +104,9 @@ class LeRobotDataset(Dataset):
         return shape[0] if isinstance(shape, list) and len(shape) == 1 and is_integer(shape[0]) else None
 
     def _of_dtype(self, dtype: str) -> list[str]:
-        return [
-            key for key, feature in self._features.items() if feature.get("dtype") == dtype and not _is_depth(feature)
-        ]
+        """The features of images or videos that are read."""
+        found = [key for key, one in self._features.items() if one.get("dtype") == dtype and not _is_depth(one)]
+        return [key for key in found if self.wanted is None or key in self.wanted]
 
     @cached_property
     def _numbers(self) -> list[str]:
@@ -160,8 +160,8 @@ class LeRobotDataset(Dataset):
     def episodes(self) -> Sequence[Episode]:
         return tuple(Episode(index, row["length"], str(index)) for index, row in self._rows.items())
 
-    def _check_statistics(self) -> None:
-        """Remember what meta/ says of the actions' range, to hold the data against it."""
+    def _read_range(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The least and the largest actions, as the statistics in meta/ have them."""
         found: list[Any] = []
         if (self.path / "meta/stats.json").is_file():
             found = [read_json(self.path / "meta/stats.json", ObservationError, limit=_MAX_BYTES, nan=True)]
@@ -173,7 +173,7 @@ class LeRobotDataset(Dataset):
         width = self._width(self._action)
         lows, highs = ([np.ravel(one.get(name, [])) for one in ranges] for name in ("min", "max"))
         right = ranges and all(len(one) == width and one.dtype.kind in "fiu" for one in (*lows, *highs))
-        self._range = (np.min(lows, 0), np.max(highs, 0)) if right else None
+        return (np.min(lows, 0), np.max(highs, 0)) if right else None
 
     # Data
 
@@ -270,10 +270,8 @@ class LeRobotDataset(Dataset):
             self._range, at = None, int(beyond.argmax())
             self.notes.append(
                 f"meta/ says that action {at} ranges from {low[at]:.4g} to {high[at]:.4g}, but episode "
-                f"{episode.number} "
-                f"has {actions[:, at].min():.4g} to {actions[:, at].max():.4g}: its statistics are of other data. "
-                "Was the "
-                "checkpoint trained with them?"
+                f"{episode.number} has {actions[:, at].min():.4g} to {actions[:, at].max():.4g}: its statistics are of "
+                "other data. Was the checkpoint trained with them?"
             )
 
     def observations(self, episode: Episode, steps: Sequence[int]) -> Iterator[dict[str, Any]]:
@@ -303,9 +301,8 @@ class LeRobotDataset(Dataset):
         assert self.fps is not None
         if episode.length > 1 and abs(float(np.median(np.diff(times))) * self.fps - 1) > 0.05:
             raise ObservationError(
-                f"{self.path}: info.json says {self.fps:g} frames a second, but the steps of episode "
-                f"{episode.number} are "
-                f"{float(np.median(np.diff(times))):.4g} s apart"
+                f"{self.path}: info.json says {self.fps:g} frames a second, but the steps of episode {episode.number} "
+                f"are {float(np.median(np.diff(times))):.4g} s apart"
             )
 
     def _frames(self, key: str, episode: Episode, times: np.ndarray) -> Iterator[np.ndarray]:

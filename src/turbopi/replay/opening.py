@@ -10,8 +10,8 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.reading import Npz
 
 EXPECTED = (
-    f"a LeRobotDataset (a folder with {INFO}), what `turbopi serve --record` wrote, or a folder of .npz or "
-    ".hdf5 episodes"
+    f"a LeRobotDataset (a folder with {INFO}), what `turbopi serve --record` wrote, or a folder of .npz or .hdf5 "
+    "episodes"
 )
 
 

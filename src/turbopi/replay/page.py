@@ -171,8 +171,6 @@ def against_text(document: ReplayDocument) -> str:
     )
     return (
         f"{second.label} beside {first.label}, the same noise: the error differs by {one.difference:+.3g}{interval}; "
-        "it is "
-        f"nearer to what was recorded at {one.nearer} of {one.moments} moments. The two are "
-        f"{significant(one.chunks.mean)} "
-        f"from each other (95 %: {significant(one.chunks.p95)})."
+        f"it is nearer to what was recorded at {one.nearer} of {one.moments} moments. The two are "
+        f"{significant(one.chunks.mean)} from each other (95 %: {significant(one.chunks.p95)})."
     )

@@ -101,7 +101,7 @@ class Report:
             for one, checkpoint in zip(self._compared, self._checkpoints, strict=True)
         ]
         beside = controls(first)
-        states = state_documents(first.run, None)
+        states = state_documents(first.run, self._state_names())
         prompts = [self._prompt(observation) for observation in self._observations]
         return ReplayDocument(
             DatasetDocument(
@@ -124,6 +124,11 @@ class Report:
             list(self._notes(first, policies[0], beside)),
             provenance(self._device),
         )
+
+    def _state_names(self) -> tuple[str, ...] | None:
+        keys = self._compared[0].run.keys
+        numbers = [source for key, source in keys.joined.items() if key not in keys.cameras]
+        return self._dataset.names_of(numbers[0]) if len(numbers) == 1 else None
 
     def _prompt(self, observation: Mapping[str, Any]) -> str:
         about = self._compared[0].run.about
@@ -151,6 +156,6 @@ class Report:
         if held is not None and held.relative < policy.relative.mean:
             yield (
                 f"{HELD}, is nearer ({significant(held.relative)}) than the policy "
-                f"({significant(policy.relative.mean)}): "
-                "over one chunk little moves here, so small errors alone say little; compare with the other controls"
+                f"({significant(policy.relative.mean)}): over one chunk little moves here, so small errors alone say "
+                "little; compare with the other controls"
             )

@@ -99,9 +99,8 @@ def chosen_episodes(dataset: Dataset, wanted: Sequence[int] | None) -> tuple[Epi
     missing = [number for number in wanted if number not in by_number]
     if missing:
         raise ConfigError(
-            f"--episodes: there is no episode {missing[0]}; {dataset.path} has {len(by_number)}, from "
-            f"{min(by_number)} to "
-            f"{max(by_number)}"
+            f"--episodes: there is no episode {missing[0]}; {dataset.path} has {len(by_number)}, from {min(by_number)} "
+            f"to {max(by_number)}"
         )
     return tuple(by_number[number] for number in dict.fromkeys(wanted))
 
@@ -140,8 +139,10 @@ class Replay:
     ) -> None:
         self.policy, self.dataset, self.settings = policy, dataset, settings
         self.horizon = policy.config.model.action_horizon
+        dataset.wanted = None
         self._first = self._read_first(episodes[0])
         self.keys = join_keys(policy, self._first.observation, settings.renames, settings.task)
+        dataset.wanted = frozenset(self.keys.joined.values())
         self.width = self._check_width(self._first.recorded.shape[1])
         self.variations = variations_of(self.keys) if settings.changed else []
 
@@ -160,9 +161,9 @@ class Replay:
         if recorded != width:
             names = f" ({', '.join(self.dataset.action_names)})" if self.dataset.action_names else ""
             raise ConfigError(
-                f"the dataset has {recorded} actions a step{names}, but robot "
-                f"{about['robot']} has {width}. Is this the checkpoint's robot (--robot)? If the dataset has several "
-                "kinds of actions, say which: --rename KEY=actions"
+                f"the dataset has {recorded} actions a step{names}, but robot {about['robot']} has {width}. Is this "
+                "the checkpoint's robot (--robot)? If the dataset has several kinds of actions, say which: --rename "
+                "KEY=actions"
             )
         return width
 
