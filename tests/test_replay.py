@@ -250,9 +250,12 @@ def test_the_command_writes_its_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("unseen_plots")
-def test_random_weights_fail(tmp_path: Path) -> None:
+def test_random_weights_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_npz(tmp_path / "data")
+    monkeypatch.setenv("COLUMNS", "80")
     ran = turbopi("replay", data, "--random-weights", "pi05_tiny", *QUICK, "--report", tmp_path / "report")
+    tables = [line for line in ran.output.splitlines() if set(line) & set("│┃━")]
+    assert len(tables) > 20 and max(map(len, tables)) <= 80 and "…" not in "".join(tables).replace(" … ", "")
     assert ran.exit_code == 1 and "don't follow" in ran.output and "weights are random" in ran.output
 
 
