@@ -1,5 +1,6 @@
 """`turbopi replay`: the small policy on its own frames is right, and planted mistakes show."""
 
+import functools
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,7 @@ from replay_data import EVERY, write_npz
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli.replay import parse_numbers
 from turbopi.policy.policy import UnifiedPolicy
-from turbopi.policy.shipped import SMALL_POLICY
+from turbopi.policy.shipped import CHASE_POLICY, SMALL_POLICY
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.replay import compare
@@ -51,19 +52,20 @@ def policy() -> UnifiedPolicy:
     return made
 
 
+def document_of(path: Path, policy: UnifiedPolicy, every: int = EVERY, variations: int = 0) -> ReplayDocument:
+    """Of the inputs changed on purpose the first `variations`."""
+    data, settings = open_dataset(path), Settings({}, changed=4)
+    replay = Replay(policy, data, data.episodes, settings)
+    replay.variations = replay.variations[:variations]
+    selection = select(data.episodes, every, 1)
+    found = replay.run(selection, lambda: None)
+    return Report(data, selection, settings, replay, found, open_checkpoint(SMALL_POLICY)).document()
+
+
 @pytest.fixture
 def replayed(policy: UnifiedPolicy) -> Callable[..., ReplayDocument]:
-    """The document of the small policy on a dataset; of the inputs changed on purpose the first `variations`."""
-
-    def run(path: Path, every: int = EVERY, variations: int = 0) -> ReplayDocument:
-        data, settings = open_dataset(path), Settings({}, changed=4)
-        replay = Replay(policy, data, data.episodes, settings)
-        replay.variations = replay.variations[:variations]
-        selection = select(data.episodes, every, 1)
-        found = replay.run(selection, lambda: None)
-        return Report(data, selection, settings, replay, found, open_checkpoint(SMALL_POLICY)).document()
-
-    return run
+    """The document of the small policy on a dataset."""
+    return functools.partial(document_of, policy=policy)
 
 
 # --- right, and planted mistakes --------------------------------------------------------------------------------------
@@ -85,6 +87,17 @@ def test_exchanged_cameras_are_named(replayed: Callable[..., ReplayDocument], tm
     document = replayed(write_npz(tmp_path / "data", swap=True), variations=1)
     assert document.verdict.level != "follows"
     assert any("image and observation/wrist_image exchanged the error falls" in one for one in document.verdict.hints)
+
+
+def test_blue_for_red_is_named(replayed: Callable[..., ReplayDocument], tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "data")
+    for file in path.glob("*.npz"):
+        with np.load(file) as stored:
+            arrays = {key: value[..., ::-1] if value.ndim == 4 else value for key, value in stored.items()}
+        np.savez(file, **arrays)
+    document = replayed(path, variations=2)
+    assert document.verdict.level != "follows"
+    assert any("red and blue exchanged the error falls" in one for one in document.verdict.hints)
 
 
 def test_degrees_for_radians_are_named(replayed: Callable[..., ReplayDocument], tmp_path: Path) -> None:
@@ -132,6 +145,13 @@ def hints_of(change: Callable[[np.ndarray], np.ndarray], reach: float = 1.0, sta
     verdict = judged(change, reach, state)
     assert (verdict.level == "follows") == (not verdict.hints)
     return verdict.hints
+
+
+def test_another_checkpoint_is_no_match(tmp_path: Path) -> None:
+    """For the same robot, by its name, with statistics of its own."""
+    other = UnifiedPolicy(CHASE_POLICY, device="cpu", precision="f32", num_denoising_steps=1)
+    verdict = document_of(write_npz(tmp_path / "data"), other).verdict
+    assert verdict.level == "differs" and "States are outside of the checkpoint's statistics" in verdict.hints[0]
 
 
 def test_what_the_actions_show_is_named() -> None:

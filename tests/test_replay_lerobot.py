@@ -193,12 +193,13 @@ def test_a_video_that_ends_too_early_is_named(tmp_path: Path) -> None:
 def test_statistics_of_other_data_are_noted(tmp_path: Path) -> None:
     folder = write_dataset(tmp_path / "data", episodes()[:1])
     stats = json.loads((folder / "meta/stats.json").read_text())
-    stats["action"] |= {"min": [-0.1] * 3, "max": [0.1] * 3}
-    (folder / "meta/stats.json").write_text(json.dumps(stats))
-    data = open_dataset(folder)
-    list(data.moments(data.episodes[0], [0], 2))
-    (note,) = data.notes
-    assert "meta/ says that action 0 ranges from -0.1 to 0.1" in note
+    for low, noted in (([-0.1] * 3, True), ([[-0.1], 1, 2], False), (None, False)):
+        stats["action"] |= {"min": low, "max": [0.1] * 3}
+        (folder / "meta/stats.json").write_text(json.dumps(stats))
+        data = open_dataset(folder)
+        list(data.moments(data.episodes[0], [0], 2))
+        assert len(data.notes) == noted, "what are no statistics is left alone"
+        assert all("meta/ says that action 0 ranges from -0.1 to 0.1" in note for note in data.notes)
 
 
 def test_a_folder_of_datasets_is_refused(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from turbopi.support.installation import install_command
 from turbopi.support.reading import (
     Fields,
     file_inside,
+    is_finite,
     is_integer,
     listing,
     one_line,
@@ -167,12 +168,11 @@ class LeRobotDataset(Dataset):
             found = [read_json(self.path / "meta/stats.json", ObservationError, limit=_MAX_BYTES, nan=True)]
         elif (self.path / "meta/episodes_stats.jsonl").is_file():
             found = [row.get("stats") for row in self._lines("meta/episodes_stats.jsonl")]
-        ranges = [
-            one[self._action] for one in found if isinstance(one, dict) and isinstance(one.get(self._action), dict)
-        ]
+        of_actions = [one.get(self._action) for one in found if isinstance(one, dict)]
+        ranges = [(one.get("min"), one.get("max")) for one in of_actions if isinstance(one, dict)]
         width = self._width(self._action)
-        lows, highs = ([np.ravel(one.get(name, [])) for one in ranges] for name in ("min", "max"))
-        right = ranges and all(len(one) == width and one.dtype.kind in "fiu" for one in (*lows, *highs))
+        right = ranges and all(_are_numbers(one, width) for pair in ranges for one in pair)
+        lows, highs = zip(*ranges, strict=True) if right else ((), ())
         return (np.min(lows, 0), np.max(highs, 0)) if right else None
 
     # Data
@@ -331,6 +331,10 @@ class LeRobotDataset(Dataset):
         if not isinstance(data, bytes):
             raise ObservationError(f"{self.path}: an image of {key} is {shown(stored)}; expected its bytes, or a path")
         return decode_image(io.BytesIO(data), f"{self.path}: an image of {key}")
+
+
+def _are_numbers(value: object, width: int | None) -> bool:
+    return isinstance(value, list) and len(value) == width and all(map(is_finite, value))
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
