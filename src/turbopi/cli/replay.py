@@ -176,6 +176,7 @@ def _second(text: str | None, config: str | None, options: PolicyOptions, opened
             raise ConfigError("--against-config is for the checkpoint of --against, which wasn't given")
         return None
     from turbopi import backends
+    from turbopi.quantization.plan import TIERS
     from turbopi.replay.report import Second, name_of
 
     if Path(text).exists():
@@ -187,6 +188,8 @@ def _second(text: str | None, config: str | None, options: PolicyOptions, opened
     backend, precision, steps = way_to_run(text, options, "a checkpoint's folder")
     backends.check(backend, backends.resolve_device(options.device), precision)  # type: ignore[arg-type]  # parsed
     own = replace(options, backend=backend, precision=precision, steps=steps)
+    if precision not in TIERS:  # a calibration is for FP8 and INT8 alone
+        own = replace(own, quantization=None, fp8_parts=None)
     return Second(own, opened, f"{backend} {precision}" + ("" if steps is None else f", {steps} steps"))
 
 
