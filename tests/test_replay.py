@@ -279,15 +279,6 @@ def test_random_weights_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert ran.exit_code == 1 and "don't follow" in ran.output and "weights are random" in ran.output
 
 
-@pytest.mark.slow
-def test_the_plots_are_drawn(tmp_path: Path) -> None:
-    report = tmp_path / "report"
-    ran = turbopi("replay", write_npz(tmp_path / "data"), SMALL_POLICY, *QUICK, "--report", report)
-    assert ran.exit_code == 0 and "The chunks follow the recorded actions" in ran.output
-    for name in ("by_index", "joints", "episode", "worst"):
-        assert np.asarray(Image.open(report / f"{name}.png")).std() > 5
-
-
 def refused(*arguments: object) -> str:
     return refusal(turbopi("replay", *arguments), whole=False)
 
