@@ -23,21 +23,33 @@ _GRIPPERS = {"gripper": "C9", "left": "C9", "right": "C8"}  # as no axis and no 
 
 @dataclass(frozen=True)
 class Row:
-    """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines."""
+    """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines.
+
+    legend   what those two are called
+    """
 
     heading: str
     camera_images: dict[str, np.ndarray]  # camera -> [h, w, 3]
     actions: np.ndarray
     oracle: np.ndarray | None = None
     expert: np.ndarray | None = None
+    legend: tuple[str, str] = ("float32 reference", "expert")
 
 
-def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
+def plot_chunks(
+    file: Path,
+    rows: Sequence[Row],
+    *,
+    robot: str,
+    title: str,
+    random_weights: bool,
+    names: Sequence[str] | None = None,
+) -> None:
     """Write a PNG with one row an observation: its images, then its action chunk by groups of one unit.
 
-    A group's axis is the same in every row. Raises as `write_figure` does.
+    A group's axis is the same in every row; `names` as for `action_groups`. Raises as `write_figure` does.
     """
-    groups = action_groups(robot, rows[0].actions.shape[1])
+    groups = action_groups(robot, rows[0].actions.shape[1], names)
     num_images = max(len(row.camera_images) for row in rows)
     limits = [_limits(group, rows) for group in groups]
     widths = [1.0] * num_images + [1.45] * len(groups)
@@ -111,15 +123,15 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
         color = _GRIPPERS.get(name, f"C{number}")
         handles += ax.plot(steps, row.actions[:, index], color=color, linewidth=1.6, label=name)
         if row.oracle is not None:
-            ax.plot(steps, row.oracle[:, index], color=color, **dot)
+            ax.plot(steps[: len(row.oracle)], row.oracle[: len(steps), index], color=color, **dot)
         if row.expert is not None:
             ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=color, **broken)
     if row.oracle is not None:
         handles.append(
-            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="float32 reference")
+            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label=row.legend[0])
         )
     if row.expert is not None:
-        handles.append(Line2D([], [], color="0.3", label="expert", **broken))
+        handles.append(Line2D([], [], color="0.3", label=row.legend[1], **broken))
     ax.set_title(group.title, fontsize=9)
     ax.set_xlabel("step of the chunk", fontsize=8)
     ax.set_ylabel(group.unit, fontsize=8)
