@@ -294,5 +294,9 @@ def test_a_state_in_other_units_than_the_training_datas_is_doubted(tmp_path: Pat
     np.savez(file, **seen)
     assert "note" not in turbopi("infer", *options).output
     np.savez(file, **seen | {"observation/state": np.degrees(seen["observation/state"])})
-    shown = " ".join(turbopi("infer", *options).output.split())
-    assert re.search(r"note: .*degrees.npz: the state is far .*: value \d is .*, in the training data .* units", shown)
+    result = turbopi("infer", *options, "--json")
+    shown = " ".join(result.stderr.split())
+    assert shown.count("note:") == 1
+    assert re.search(r"note: .*degrees.npz: the state is far .*: x is .*, in the training data .* units", shown)
+    ((note,),) = json.loads(result.stdout)["notes"]
+    assert note["kind"] == "state_range" and note["names"][0] == "x"

@@ -12,7 +12,7 @@ from turbopi.cli.capabilities import check_server, check_warmup
 from turbopi.cli.files import check_folder
 from turbopi.cli.fleet_update import Requested
 from turbopi.cli.framework import Output, command, log_to_stderr
-from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.options import ActingOptions, CheckpointArgument
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
 from turbopi.serve.options import MAX_BATCH, ServerOptions
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @command(
     "serve",
-    shared=PolicyOptions,
+    shared=ActingOptions,
     examples=(
         "turbopi serve checkpoints/pi05_libero --config pi05_libero",
         "turbopi serve checkpoints/mine --host 0.0.0.0 --api-key-file key",
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     ),
 )
 def serve(
-    options: PolicyOptions,
+    options: ActingOptions,
     context: typer.Context,
     checkpoint: CheckpointArgument = None,
     host: Annotated[
@@ -234,8 +234,10 @@ class _Cold:
     def pipelined(self) -> bool:
         return self._policy.pipelined
 
+    gives_readings = True
+
     def infer(self, obs: dict[str, object], /, **arguments: Any) -> dict[str, object]:
         return self._policy.infer(obs, **arguments)
 
-    def submit(self, obs: dict[str, object], /) -> "Future[dict[str, object]]":
-        return self._policy.submit(obs)
+    def submit(self, obs: dict[str, object], /, **arguments: Any) -> "Future[dict[str, object]]":
+        return self._policy.submit(obs, **arguments)

@@ -44,15 +44,25 @@ _GROUPS: dict[str, list[ActionGroup]] = {
 }
 
 
-def action_groups(robot: str, dims: int) -> list[ActionGroup]:
-    """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible."""
-    groups = _GROUPS.get(robot, [])
+def known_groups(robot: str) -> list[ActionGroup]:
+    """The groups of a robot that comes with Turbo-Pi; none for others."""
+    return _GROUPS.get(robot, [])
+
+
+def action_groups(robot: str, dims: int, names: Sequence[str] = ()) -> list[ActionGroup]:
+    """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible.
+
+    names  of an unknown robot's actions, as far as there are any
+    """
+    groups = known_groups(robot)
     if sum(len(group.names) for group in groups) == dims:
         return groups
     eights = [range(start, min(start + 8, dims)) for start in range(0, dims, 8)]
     return [
         ActionGroup(
-            f"actions {eight[0]} to {eight[-1]}", "the robot's units", {index: f"dim {index}" for index in eight}
+            f"actions {eight[0]} to {eight[-1]}",
+            "the robot's units",
+            {index: names[index] if index < len(names) else f"dim {index}" for index in eight},
         )
         for eight in eights
     ]

@@ -1,0 +1,113 @@
+"""Where the values of the training data lie, by the checkpoint's statistics, and which values are outside."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from turbopi.checkpoint.norm_stats import FeatureStats
+from turbopi.policy.watch import FAR, NEAR, Outside, listed_values
+from turbopi.robots import Robot
+from turbopi.robots.labels import Label, is_built_in
+
+DEVIATIONS = 3.0  # about the mean, where there are no quantiles and no extremes
+
+
+class DrawnRange(NamedTuple):
+    """For plots: NaN where a dimension has no range there."""
+
+    labels: tuple[Label, ...]
+    low: np.ndarray
+    high: np.ndarray
+
+
+class TrainingRange:
+    """One feature's range: its 1 % and 99 % quantiles; else least and most; else mean ± DEVIATIONS · std.
+
+    labels  of its dimensions: it judges as many values as there are labels and statistics
+
+    A dimension that was constant in training has no range, so nothing is outside; where the statistics also have the
+    extremes, nothing up to them is far.
+    """
+
+    def __init__(self, stats: FeatureStats | None, labels: Sequence[Label]) -> None:
+        self.source, low, high = _range_of(stats)
+        self.labels = tuple(labels)[: len(low)]
+        self.low, self.high = low[: len(self.labels)], high[: len(self.labels)]
+        width = np.where(self.high > self.low, self.high - self.low, np.inf)
+        self._widths = width
+        self._near = self.low - NEAR * width, self.high + NEAR * width
+        self.least, self.most = self.low - FAR * width, self.high + FAR * width  # what isn't far
+        if stats is not None and stats.min is not None and stats.max is not None:
+            self.least = np.minimum(self.least, stats.min[: len(low)][: len(self.labels)])
+            self.most = np.maximum(self.most, stats.max[: len(low)][: len(self.labels)])
+
+    @property
+    def drawn(self) -> DrawnRange:
+        return DrawnRange(self.labels, self.low, self.high)
+
+    def drawn_of_actions(self, robot: Robot, width: int) -> DrawnRange:
+        """In the units that the robot gets. Relative actions have no range there, nor do a class's of the user.
+
+        width  of the model's actions, un-normalised
+        """
+        few, mask = len(self.labels), np.array(robot.delta_mask or (), np.bool_)
+        nowhere = np.full(few, np.nan)
+        if not is_built_in(robot) or not few:
+            return DrawnRange(self.labels, nowhere, nowhere)
+        ends = np.zeros((2, max(width, few)))
+        ends[:, :few] = self.low, self.high
+        ends = np.sort(np.array(robot.outputs(ends), np.float64)[:, :few], axis=0)  # some joints turn the other way
+        ends[:, : len(mask)][:, mask[:few]] = np.nan
+        return DrawnRange(self.labels, *ends)
+
+    def in_widths(self, values: np.ndarray) -> np.ndarray:
+        """float[d] divided by the widths of the range, where constant dimensions are 0; a copy without statistics."""
+        few = len(self._widths)
+        if len(values) == few:
+            return np.asarray(values / self._widths)
+        return values[:few] / self._widths[: len(values)] if few else values.astype(np.float64)
+
+    def outside(self, values: np.ndarray) -> tuple[Outside, ...]:
+        """Of float[d], which are outside. Nearly always none: then it takes 3 us."""
+        low, high = self._near
+        if len(values) != len(low):
+            few = min(len(values), len(low))
+            values, low, high = values[:few], low[:few], high[:few]
+        beyond = (values < low) | (values > high)
+        if b"\1" not in beyond.tobytes():
+            return ()
+        return tuple(self._outside(int(index), float(values[index])) for index in np.flatnonzero(beyond))
+
+    def _outside(self, index: int, value: float, step: int | None = None) -> Outside:
+        far = not self.least[index] <= value <= self.most[index]
+        return Outside(self.labels[index].name, value, float(self.low[index]), float(self.high[index]), far, step)
+
+    def worst(self, chunk: np.ndarray) -> tuple[Outside, ...]:
+        """Of actions float[H, d], of each dimension that has far ones the farthest."""
+        values = chunk[:, : len(self.labels)]
+        beyond = np.maximum(self.least - values, values - self.most)  # [H, d], above 0: far
+        steps = beyond.argmax(axis=0)
+        found = [(int(step), index) for index, step in enumerate(steps) if beyond[step, index] > 0]
+        return tuple(self._outside(index, float(values[step, index]), step) for step, index in found)
+
+
+def _range_of(stats: FeatureStats | None) -> tuple[str, np.ndarray, np.ndarray]:
+    """What the range is made of, and its two ends float64[d]."""
+    if stats is not None and stats.q01 is not None and stats.q99 is not None:
+        return "q01 to q99", stats.q01, stats.q99
+    if stats is not None and stats.min is not None and stats.max is not None:
+        return "min to max", stats.min, stats.max
+    if stats is not None and stats.mean is not None and stats.std is not None:
+        half = DEVIATIONS * stats.std
+        return f"mean ± {DEVIATIONS:g} std", stats.mean - half, stats.mean + half
+    return "none", np.empty(0), np.empty(0)
+
+
+def refusal(found: Sequence[Outside]) -> str:
+    """Why actions that are far outside are refused."""
+    return (
+        f"actions that are far from the training data aren't given to the robot (--out-of-range refuse): "
+        f"{listed_values(found, 'reaches')}. More than {FAR:g} widths of that range beyond it is far. Look at the "
+        "state, the cameras and the checkpoint's statistics (`turbopi inspect`)"
+    )

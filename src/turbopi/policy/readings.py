@@ -1,0 +1,126 @@
+"""What a call shows of its robot: values outside the training data, and a few pixels of each camera.
+
+A reading remembers nothing, so that any policy of a fleet may make it; `turbopi.policy.watch` compares the readings of
+one robot. A call without findings costs about 10 us with two cameras (docs/dev/serving.md).
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from turbopi.checkpoint.norm_stats import NormStats
+from turbopi.policy.ranges import TrainingRange, refusal
+from turbopi.policy.watch import Reading, Sample
+from turbopi.preprocess.pipeline import Incoming, Pipeline, of_row
+from turbopi.robots.base import Example
+from turbopi.robots.labels import action_labels, camera_label, state_labels
+from turbopi.support.errors import ActionError, ConfigError
+
+OutOfRange = Literal["warn", "refuse", "clip"]
+GRID = 16  # pixels of an image that are looked at, in each direction
+
+
+class Checks:
+    """Makes the readings of one policy.
+
+    out_of_range     what becomes of actions that are far outside: "warn" leaves them, "clip" moves them to the end of
+                     what isn't far, "refuse" raises
+    judges_ranges    False: the statistics are made up
+
+    Raises ConfigError for another `out_of_range`.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, stats: NormStats, out_of_range: OutOfRange = "warn", judges_ranges: bool = True
+    ) -> None:
+        if out_of_range not in get_args(OutOfRange):
+            raise ConfigError(f"out_of_range is {out_of_range!r}; choose one of {', '.join(get_args(OutOfRange))}")
+        self.out_of_range, self._robot, self._pipeline = out_of_range, pipeline.robot, pipeline
+        robot, action_width = pipeline.robot, pipeline.metadata["robot_action_dim"]
+        state_width = pipeline.state_scale.width if robot.state_dim is None else robot.state_dim
+        judged = stats if judges_ranges or out_of_range != "warn" else NormStats()
+        self.state = TrainingRange(judged.state if judges_ranges else None, state_labels(robot, state_width or 0))
+        self.actions = TrainingRange(judged.actions, action_labels(robot, action_width))
+        self._least, self._most = self._normalized(self.actions.least), self._normalized(self.actions.most)
+        self._labels: dict[str, str] = {}
+
+    def _normalized(self, ends: np.ndarray) -> np.ndarray:
+        """float64[d], of actions, as the model has them: float32[d]."""
+        scale = self._pipeline.action_scale
+        if scale.width is None or not len(ends):
+            return ends.astype(np.float32)
+        whole = np.zeros(scale.width)
+        whole[: len(ends)] = ends
+        return scale.normalize(whole)[: len(ends)].astype(np.float32)
+
+    def reading(self, seen: Incoming) -> Reading | None:
+        """Of an observation that the pipeline has seen; None for a made-up one."""
+        if isinstance(seen.observation, Example):
+            return None
+        state = np.asarray(seen.robot.state).reshape(-1)
+        return Reading(self.state.in_widths(state), self.state.outside(state), images=self._images(seen))
+
+    def _images(self, seen: Incoming) -> dict[str, Sample]:
+        images, labels = seen.robot.images, self._labels
+        for camera in seen.cameras:
+            if camera not in labels:
+                labels[camera] = camera_label(self._robot, camera)
+        return {
+            labels[camera]: sample(np.asarray(images[camera]))
+            for camera, valid in zip(seen.cameras, seen.valid, strict=True)
+            if valid
+        }
+
+    def judge(
+        self, chunks: np.ndarray, readings: Sequence[Reading | None]
+    ) -> tuple[np.ndarray, Sequence[Reading | None]]:
+        """The chunks float32[B, H, action_dim] that the robots may have, and the readings with what was found.
+
+        Raises ActionError of the first row that is far outside, if such actions are refused. Chunks that aren't finite
+        are left for the pipeline to refuse. What was computed from made-up observations isn't judged.
+        """
+        used = chunks[..., : len(self._least)]
+        beyond = (used < self._least) | (used > self._most)
+        if b"\1" not in beyond.tobytes() or not np.isfinite(chunks).all():
+            return chunks, readings
+        clips, judged, allowed = self.out_of_range == "clip", list(readings), chunks
+        for row in np.flatnonzero(beyond.any(axis=(1, 2))):
+            one, found = readings[row], self.actions.worst(self._pipeline.action_scale.unnormalize(chunks[row]))
+            if one is None or not found:  # the latter by the rounding to float32
+                continue
+            if self.out_of_range == "refuse":
+                raise ActionError(of_row(int(row), len(chunks), refusal(found)))
+            judged[row] = one._replace(actions=found, clipped=clips)
+            if clips:
+                allowed = chunks.copy() if allowed is chunks else allowed
+                np.clip(used[row], self._least, self._most, out=allowed[row, :, : len(self._least)])
+        return allowed, judged
+
+
+def sample(image: np.ndarray) -> Sample:
+    """Of an image uint8[h, w, 3], or float[h, w, 3] in [0, 1]."""
+    height, width, _ = image.shape
+    if image.flags.c_contiguous:  # a third of the time
+        few = image.reshape(-1).take(_grid(height, width))
+    else:
+        rows, columns = _lines(height), _lines(width)
+        few = image[rows.start :: rows.step, columns.start :: columns.step][:GRID, :GRID]
+    if few.dtype != np.uint8:
+        few = (few.clip(0, 1) * 255).astype(np.uint8)
+    return Sample((height, width), few.tobytes())
+
+
+def _lines(size: int) -> range:
+    """The rows or columns that are looked at, spread evenly."""
+    step = max(1, size // GRID)
+    return range(step // 2, size, step)[:GRID]
+
+
+@functools.lru_cache(maxsize=32)
+def _grid(height: int, width: int) -> np.ndarray:
+    """Where the pixels that are looked at are in a contiguous image."""
+    rows, columns = np.array(_lines(height)), np.array(_lines(width))
+    pixels = (rows[:, None] * width + columns).reshape(-1, 1)
+    return np.asarray((3 * pixels + np.arange(3)).ravel())
