@@ -82,6 +82,14 @@ def kinds(answer: Any) -> list[str]:
     return [note.kind for note in notes_in(answer)]
 
 
+def test_the_metadata_say_which_policy_it_is(policy: UnifiedPolicy) -> None:
+    opened = open_checkpoint(SMALL_POLICY)
+    about = policy.metadata
+    assert about["checkpoint_path"] == str(SMALL_POLICY) and about["weights"] == opened.fingerprint()[:12]
+    assert about["random_weights"] is False and about["calibration"] is None and about["out_of_range"] == "warn"
+    assert (about["config"], about["num_denoising_steps"]) == ("pi05_tiny", 1)
+
+
 # --- state ------------------------------------------------------------------------------------------------------------
 
 

@@ -75,12 +75,12 @@ class Checkpoint:
 
     @property
     def random(self) -> str | None:
-        """ "seed 0" of random weights, in whatever file they are; None: they aren't, as far as is known."""
+        """ "seed 0" of random weights; None: they aren't, as far as is known."""
         return getattr(self.source, "random", None)
 
     @cached_property
     def short_hash(self) -> str | None:
-        """The first 12 digits of `fingerprint`, if that is cached or made at once, as for small weights; else None."""
+        """12 digits of `fingerprint`, if it is cached, or the weights are small; else None."""
         known = hasattr(self.source, "recipe") or getattr(self.source, "weights_sha256", None) is not None
         if known or self.stored_bytes <= SMALL_BYTES:
             return self.fingerprint(trust_files=True)[:12]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from turbopi.config import ModelConfig
     from turbopi.policy.policy import UnifiedPolicy
+    from turbopi.policy.ranges import DrawnRange
     from turbopi.policy.watch import Reading
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
@@ -111,7 +112,7 @@ def infer(
         read_state(seen.robot.state, "state", None)
         judges_ranges = opened.format != "random"
         checks = Checks(pipeline, opened.norm_stats, options.out_of_range, judges_ranges)  # type: ignore[arg-type]
-    noted = _Notes(output)
+    noted, ranges = _Notes(output), checks.drawn
     noted.of(sources[0], checks.reading(seen))
     model = opened.config.model
     if given_noise is not None:  # now: it is no observation's fault
@@ -127,7 +128,7 @@ def infer(
     _show_timings([answer.timing for answer in answers], output)
     _write(out, answers, output)
     if drawing is not None:
-        _plot(drawing, policy, answers)
+        _plot(drawing, policy, answers, ranges)
         output.line(f"plot written to {drawing}")
     output.document(
         {
@@ -286,7 +287,7 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
     output.line(STAGES, "dim")
 
 
-def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer]) -> None:
+def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: dict[str, "DrawnRange"]) -> None:
     from turbopi.support.action_groups import images_of
     from turbopi.support.plots import Row, plot_chunks
 
@@ -304,9 +305,7 @@ def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer]) -> None:
     title = f"{about['config']}, {about['backend']} {about['precision']} on {about['device_name']}"
     if len(rows) < len(answers):
         title += f": the first {len(rows)} of {len(answers)} calls"
-    plot_chunks(
-        file, rows, robot=about["robot"], title=title, random_weights=about["random_weights"], **policy.training_ranges
-    )
+    plot_chunks(file, rows, robot=about["robot"], title=title, random_weights=about["random_weights"], **ranges)
 
 
 def _prompt(observation: dict[str, Any], about: dict[str, Any]) -> str:

@@ -34,7 +34,6 @@ from turbopi.policy.call_options import (
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.model_call import ModelCall
-from turbopi.policy.ranges import DrawnRange
 from turbopi.policy.readings import Checks, OutOfRange
 from turbopi.policy.watch import PolicyWatch
 from turbopi.preprocess.pipeline import Pipeline
@@ -70,8 +69,8 @@ class UnifiedPolicy:
         default_prompt: for observations without a prompt.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
-        out_of_range: what becomes of actions far outside the checkpoint's training range: "warn" leaves them, "clip"
-            moves them to the end of what isn't far, "refuse" raises ActionError (docs/safety.md).
+        out_of_range: what becomes of actions far outside the training range: "warn", "clip" or "refuse", with an
+            ActionError (docs/safety.md).
         strict: refuse calls that `warmup` didn't cover, with an ObservationError, instead of compiling while a robot
             moves.
 
@@ -176,8 +175,7 @@ class UnifiedPolicy:
             conditioning: instead of `previous`, exact instructions to the denoising loop (models/pi0/conditioning.py).
                 One with its own times or solver determines the number of steps.
             model_actions: also return what the next call's `previous` needs.
-            readings: for a server, which knows several robots apart: what `turbopi/notes` would be made of, under
-                "reading", and no notes.
+            readings: for a server: what notes are made of, under "reading", instead of them.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
@@ -189,14 +187,13 @@ class UnifiedPolicy:
             postprocess_ms   un-normalising and the robot's own outputs
             total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
 
-        If there is something to say of the observation or the actions, also "turbopi/notes" (docs/safety.md), a list of
-        {"kind", "names", "text"}. All calls of `infer` and `submit` since `reset` count as one robot's.
+        If there is something to say, also "turbopi/notes" (docs/safety.md), a list of {"kind", "names", "text"}.
 
         With `model_actions` also "model_actions": float32[H, action_dim], normalised, and for relative actions
         "anchor": float64[d], the state that they are relative to.
 
-        Raises ObservationError for wrong arguments, ActionError if an action is NaN or infinite, or far outside the
-        training range with out_of_range="refuse", DeviceLost once the GPU has failed for good (`lost`).
+        Raises ObservationError for wrong arguments, ActionError if an action is NaN, infinite or refused, DeviceLost
+        once the GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
@@ -224,8 +221,7 @@ class UnifiedPolicy:
 
         `noise` is [B, H, action_dim]; `seed` is the first row's, the next row has the next number, or one for each row.
         `conditioning` and `previous` have one entry for each row, None for an unconditioned one; `model_actions` is one
-        flag or one for each row. All rows take the same number of denoising steps. Errors name the row. As rows may be
-        of different robots, `turbopi/notes` compares no row with another.
+        flag or one for each row. All rows take the same number of denoising steps. Errors name the row.
 
         If `runs_batches`, the backend computes 1, 2, 4, 8 or 16 observations together and splits other numbers; else
         one by one, as with another solver than Euler's. Cameras and prompts may differ. Rows with fixed actions,
@@ -330,7 +326,7 @@ class UnifiedPolicy:
         return answer
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`: `turbopi/notes` compare it with nothing before."""
+        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before."""
         self._watch.reset()
 
     def warmup(
@@ -438,12 +434,6 @@ class UnifiedPolicy:
     def pipeline(self) -> Pipeline:
         """What happens before and after the model."""
         return self._pipeline
-
-    @property
-    def training_ranges(self) -> dict[str, DrawnRange]:
-        """Of the state and the actions, for plots; empty ones where the statistics are made up."""
-        actions = self._checks.actions.drawn_of_actions(self._pipeline.robot, self.config.model.action_dim)
-        return {"state_range": self._checks.state.drawn, "action_range": actions}
 
     @property
     def metadata(self) -> dict[str, Any]:

@@ -223,8 +223,10 @@ class CameraWatch:
         same = [name for name, one in images.items() if not self._changed(name, one, state, found)]
         for name in same:
             camera = self._cameras[name]
+            if camera.same % FROZEN == 0 and not camera.moved:
+                camera.moved = _far_apart(camera.state, state)
             camera.moved = camera.moved or len(same) < len(images)
-            if camera.same >= FROZEN and (camera.moved or _far_apart(camera.state, state)):
+            if camera.same >= FROZEN and camera.moved:
                 found.append(
                     Note(
                         "camera_frozen",
