@@ -35,7 +35,7 @@ class TrainingRange:
         self.labels = tuple(labels)[: len(low)]
         self.low, self.high = low[: len(self.labels)], high[: len(self.labels)]
         width = np.where(self.high > self.low, self.high - self.low, np.inf)
-        self._widths = width
+        self.widths: list[float] = width.tolist()  # infinite where there is no range
         self._near = (self.low - NEAR * width).tolist(), (self.high + NEAR * width).tolist()
         self.least, self.most = self.low - FAR * width, self.high + FAR * width  # what isn't far
         if stats is not None and stats.min is not None and stats.max is not None:
@@ -61,22 +61,14 @@ class TrainingRange:
         ends[:, : len(mask)][:, mask[:few]] = np.nan
         return DrawnRange(self.labels, *ends)
 
-    def in_widths(self, values: np.ndarray) -> np.ndarray:
-        """float[d] divided by the widths of the range, where constant dimensions are 0; a copy without statistics."""
-        few = len(self._widths)
-        if len(values) == few:
-            return np.asarray(values / self._widths)
-        return values[:few] / self._widths[: len(values)] if few else values.astype(np.float64)
-
-    def outside(self, values: np.ndarray) -> tuple[Outside, ...]:
-        """Of float[d], which are outside."""
-        given: list[float] = values.tolist()  # a loop over few numbers is sooner done than NumPy begins
-        for value, low, high in zip(given, *self._near, strict=False):
+    def outside(self, values: Sequence[float]) -> tuple[Outside, ...]:
+        """Which are outside. A loop over few numbers is sooner done than NumPy begins."""
+        for value, low, high in zip(values, *self._near, strict=False):
             if not low <= value <= high:
                 break
         else:
             return ()
-        known = enumerate(zip(given, *self._near, strict=False))
+        known = enumerate(zip(values, *self._near, strict=False))
         return tuple(self._outside(i, value) for i, (value, low, high) in known if not low <= value <= high)
 
     def _outside(self, index: int, value: float, step: int | None = None) -> Outside:

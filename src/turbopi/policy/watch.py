@@ -40,7 +40,8 @@ FROZEN = 5  # calls
 REPEAT_SECONDS = 60.0  # until the log says the same of the same joint or camera again
 MOVED = 0.025  # widths of the training range of a value of the state: then the robot isn't where it was
 DARK = bytes(range(8))  # grey levels of a black image
-COMPARED_EVERY = 8  # calls: with the images of before
+MOST_CAMERAS = 64  # that are remembered: no robot has as many
+COMPARED_EVERY = 16  # calls: with the images of before
 DIFFERENT = 12.0  # grey levels in the mean, from the images of before: these may be another camera's
 _LEARNING = 0.25  # of the images of before, in each comparison
 
@@ -57,7 +58,7 @@ class Outside(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Of one image: its height and width, and 16 x 16 of its pixels, uint8 RGB."""
+    """Of one image: its height and width, and 12 x 12 of its pixels, uint8 RGB."""
 
     shape: tuple[int, ...]
     pixels: bytes
@@ -66,14 +67,16 @@ class Sample(NamedTuple):
 class Reading(NamedTuple):
     """Of one call.
 
-    state    of the robot, float64, in widths of the training range: how far it has moved is told by that
+    state    of the robot
+    widths   of the training range of its values: how far it has moved is told by them
     outside  values of the state that are outside the training range
     actions  the farthest value of each action that is far outside
     clipped  whether the actions were clipped
     images   by camera, under the robot's own key
     """
 
-    state: np.ndarray
+    state: Sequence[float]
+    widths: Sequence[float] = ()
     outside: tuple[Outside, ...] = ()
     actions: tuple[Outside, ...] = ()
     clipped: bool = False
@@ -81,7 +84,7 @@ class Reading(NamedTuple):
 
 
 class Watch:
-    """Of one robot. For one thread at a time; a call without a finding takes 5 us with two cameras.
+    """Of one robot. For one thread at a time.
 
     remembers  False: the readings are of several robots, so none is compared with the one before
     clock      in seconds
@@ -140,7 +143,7 @@ class Watch:
     def _of_cameras(self, reading: Reading) -> list[Note]:
         if not self._remembers:
             return [note for name, one in reading.images.items() for note in _black(name, one)]
-        return self._cameras.notes(reading.images, reading.state)
+        return self._cameras.notes(reading)
 
 
 class PolicyWatch:
@@ -202,7 +205,7 @@ class _Camera:
 
     shape: tuple[int, ...]
     pixels: bytes
-    state: np.ndarray
+    state: Sequence[float]
     same: int = 1
     moved: bool = False
 
@@ -217,14 +220,15 @@ class CameraWatch:
         self._before: np.ndarray = np.empty((0, 0), np.float32)  # [C, pixels]: their images, a mean of the last ones
         self._suspected: list[Note] = []  # by the last comparison
 
-    def notes(self, images: Mapping[str, Sample], state: np.ndarray) -> list[Note]:
-        """What there is to say of a call's images, at the state of the robot float[s] (`Reading.state`)."""
+    def notes(self, reading: Reading) -> list[Note]:
+        """What there is to say of a call's images."""
         found: list[Note] = []
+        images, state = reading.images, reading.state
         same = [name for name, one in images.items() if not self._changed(name, one, state, found)]
         for name in same:
             camera = self._cameras[name]
             if camera.same % FROZEN == 0 and not camera.moved:
-                camera.moved = _far_apart(camera.state, state)
+                camera.moved = _far_apart(camera.state, state, reading.widths)
             camera.moved = camera.moved or len(same) < len(images)
             if camera.same >= FROZEN and camera.moved:
                 found.append(
@@ -240,11 +244,13 @@ class CameraWatch:
         self._calls += 1
         return found
 
-    def _changed(self, name: str, one: Sample, state: np.ndarray, found: list[Note]) -> bool:
+    def _changed(self, name: str, one: Sample, state: Sequence[float], found: list[Note]) -> bool:
         """Whether the image isn't the last one; adds what can be said of it alone."""
         found += _black(name, one)
         camera = self._cameras.get(name)
         if camera is None:
+            if len(self._cameras) >= MOST_CAMERAS:
+                self._cameras.clear()
             self._cameras[name] = _Camera(*one, state)
             return True
         if camera.shape != one.shape:
@@ -302,14 +308,16 @@ class CameraWatch:
         return found
 
 
-def _far_apart(before: np.ndarray, state: np.ndarray) -> bool:
-    return before.shape != state.shape or float(np.abs(state - before).max(initial=0.0)) > MOVED
+def _far_apart(before: Sequence[float], state: Sequence[float], widths: Sequence[float]) -> bool:
+    each = zip(before, state, widths or itertools.repeat(1.0), strict=False)
+    return any(abs(a - b) > MOVED * width for a, b, width in each)
 
 
 def _black(name: str, one: Sample) -> list[Note]:
     if not one.pixels.strip(DARK):
         return [Note("camera_black", (name,), f"camera {name} is black")]
-    if one.pixels == one.pixels[:3] * (len(one.pixels) // 3):
+    first = one.pixels[:3]
+    if first == one.pixels[-3:] and one.pixels == first * (len(one.pixels) // 3):
         return [
             Note("camera_black", (name,), f"camera {name} has one colour everywhere: {tuple(one.pixels[:3])} in RGB")
         ]
