@@ -233,6 +233,8 @@ def test_refused_actions_name_joint_value_and_range_and_the_row(fixed: Fixed) ->
         policy.infer_batch(seen[:2], seed=0)
     with pytest.raises(ActionError, match=named):
         policy.submit(seen[0], seed=0, serially=True).result()
+    with pytest.raises(ActionError, match="The state is far outside, too: axis-angle x is 180, in the training data"):
+        policy.infer(in_degrees(seen[0]), seed=0)
     policy.infer(policy.example_observation(), seed=0)  # a made-up one, as in warm-up
 
 
@@ -246,7 +248,7 @@ def test_no_mode_lets_a_number_that_is_not_finite_pass(fixed: Fixed, mode: str) 
 
 
 def test_an_unknown_mode_is_refused(fixed: Fixed) -> None:
-    with pytest.raises(ConfigError, match="out_of_range is 'clamp'; choose one of warn, refuse, clip"):
+    with pytest.raises(ConfigError, match="unknown out_of_range='clamp'; choose one of warn, refuse, clip"):
         policy_of(fixed, out_of_range="clamp")
 
 
@@ -298,6 +300,13 @@ def test_a_frozen_camera_is_named_by_the_robots_own_key(policy: UnifiedPolicy) -
     assert note.names == (WRIST,) and f"same image in {FROZEN + 1} calls" in note.text
     policy.reset()
     assert kinds(policy.infer(first, seed=0)) == []
+
+
+def test_an_image_that_changes_where_no_pixel_is_looked_at_is_no_frozen_one(policy: UnifiedPolicy) -> None:
+    for call, one in enumerate(moving(policy, 4 * FROZEN)):
+        still = frames(policy)[0][WRIST].copy()
+        still[0, :30] = 10 * call
+        assert kinds(policy.infer({**one, WRIST: still}, seed=0)) == []
 
 
 def test_a_black_camera_and_one_of_a_single_colour_are_named_at_the_first_call(policy: UnifiedPolicy) -> None:

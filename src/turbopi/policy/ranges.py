@@ -96,10 +96,12 @@ def _range_of(stats: FeatureStats | None) -> tuple[str, np.ndarray, np.ndarray]:
     return "none", np.empty(0), np.empty(0)
 
 
-def refusal(found: Sequence[Outside]) -> str:
-    """Why actions that are far outside are refused."""
+def refusal(found: Sequence[Outside], state: Sequence[Outside]) -> str:
+    """Why actions that are far outside are refused; `state`: its values that are outside, which may be the reason."""
+    far = [one for one in state if one.far]
+    reason = f"The state is far outside, too: {listed_values(far)}. " if far else ""
     return (
-        f"actions that are far from the training data aren't given to the robot (--out-of-range refuse): "
-        f"{listed_values(found, 'reaches')}. More than {FAR:g} widths of that range beyond it is far. Look at the "
-        "state, the cameras and the checkpoint's statistics (`turbopi inspect`)"
+        f"actions that are far from the training data aren't given to the robot (out_of_range='refuse'): "
+        f"{listed_values(found, 'reaches')}. More than {FAR:g} widths of that range beyond it is far. {reason}Look at "
+        "the state, the cameras and the checkpoint's statistics (`turbopi inspect`)"
     )

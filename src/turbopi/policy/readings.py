@@ -37,7 +37,7 @@ class Checks:
         self, pipeline: Pipeline, stats: NormStats, out_of_range: OutOfRange = "warn", judges_ranges: bool = True
     ) -> None:
         if out_of_range not in get_args(OutOfRange):
-            raise ConfigError(f"out_of_range is {out_of_range!r}; choose one of {', '.join(get_args(OutOfRange))}")
+            raise ConfigError(f"unknown out_of_range={out_of_range!r}; choose one of {', '.join(get_args(OutOfRange))}")
         self.out_of_range, self._robot, self._pipeline = out_of_range, pipeline.robot, pipeline
         robot, action_width = pipeline.robot, pipeline.metadata["robot_action_dim"]
         state_width = pipeline.state_scale.width if robot.state_dim is None else robot.state_dim
@@ -98,7 +98,7 @@ class Checks:
             if one is None or not found:  # the latter by the rounding to float32
                 continue
             if self.out_of_range == "refuse":
-                raise ActionError(of_row(int(row), len(chunks), refusal(found)))
+                raise ActionError(of_row(int(row), len(chunks), refusal(found, one.outside)))
             judged[row] = one._replace(actions=found, clipped=clips)
             if clips:
                 allowed = chunks.copy() if allowed is chunks else allowed
@@ -108,15 +108,15 @@ class Checks:
 
 def sample(image: np.ndarray) -> Sample:
     """Of an image uint8[h, w, 3], or float[h, w, 3] in [0, 1]."""
-    height, width, _ = image.shape
+    shape = image.shape[:2]
     if image.flags.c_contiguous:  # a third of the time
-        few = image.reshape(-1).take(_grid(height, width))
+        few = image.reshape(-1).take(_grid(shape))
     else:
-        rows, columns = _lines(height), _lines(width)
+        rows, columns = map(_lines, shape)
         few = image[rows.start :: rows.step, columns.start :: columns.step][: len(rows), : len(columns)]
     if few.dtype != _UINT8:
         few = (few.clip(0, 1) * 255).astype(_UINT8)
-    return Sample((height, width), few.tobytes())
+    return Sample(shape, few.tobytes(), image)
 
 
 def _lines(size: int) -> range:
@@ -126,8 +126,8 @@ def _lines(size: int) -> range:
 
 
 @functools.lru_cache(maxsize=32)
-def _grid(height: int, width: int) -> np.ndarray:
+def _grid(shape: tuple[int, int]) -> np.ndarray:
     """Where the pixels that are looked at are in a contiguous image."""
-    rows, columns = np.array(_lines(height)), np.array(_lines(width))
-    pixels = (rows[:, None] * width + columns).reshape(-1, 1)
+    rows, columns = (np.array(_lines(size)) for size in shape)
+    pixels = (rows[:, None] * shape[1] + columns).reshape(-1, 1)
     return np.asarray((3 * pixels + np.arange(3)).ravel())

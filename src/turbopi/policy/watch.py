@@ -19,6 +19,7 @@ import itertools
 import logging
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -57,11 +58,28 @@ class Outside(NamedTuple):
     step: int | None = None  # of a chunk, from 0
 
 
-class Sample(NamedTuple):
-    """Of one image: its height and width, and 12 x 12 of its pixels, uint8 RGB."""
+class Sample:
+    """Of one image: its height and width, and 12 x 12 of its pixels, uint8 RGB.
 
-    shape: tuple[int, ...]
-    pixels: bytes
+    image  itself, which isn't copied
+    whole  CRC-32 of it, made when it is wanted, and when a sample is sent to another process
+    """
+
+    __slots__ = ("_image", "_whole", "pixels", "shape")
+
+    def __init__(
+        self, shape: tuple[int, ...], pixels: bytes, image: np.ndarray | None = None, whole: int | None = None
+    ) -> None:
+        self.shape, self.pixels, self._image, self._whole = shape, pixels, image, whole
+
+    @property
+    def whole(self) -> int | None:
+        if self._whole is None and self._image is not None:
+            self._whole = zlib.crc32(np.ascontiguousarray(self._image).data)
+        return self._whole
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Sample, (self.shape, self.pixels, None, self.whole)
 
 
 class Reading(NamedTuple):
@@ -199,8 +217,8 @@ def _of_actions(reading: Reading) -> Note:
 
 @dataclass
 class _Camera:
-    """shape and pixels of the last image, and the robot's state when it came; `same` calls had it. `moved`: meanwhile
-    another camera's image has changed.
+    """shape and pixels of the last image, and the robot's state when it came; `same` calls had these pixels, and in the
+    second of them the image was `whole`. `moved`: meanwhile another camera's image has changed, or the robot moved.
     """
 
     shape: tuple[int, ...]
@@ -208,6 +226,7 @@ class _Camera:
     state: Sequence[float]
     same: int = 1
     moved: bool = False
+    whole: int | None = None
 
 
 class CameraWatch:
@@ -227,10 +246,14 @@ class CameraWatch:
         same = [name for name, one in images.items() if not self._changed(name, one, state, found)]
         for name in same:
             camera = self._cameras[name]
+            camera.moved = camera.moved or len(same) < len(images)
             if camera.same % FROZEN == 0 and not camera.moved:
                 camera.moved = _far_apart(camera.state, state, reading.widths)
-            camera.moved = camera.moved or len(same) < len(images)
-            if camera.same >= FROZEN and camera.moved:
+            if camera.same < FROZEN or not camera.moved:
+                continue
+            if camera.whole != images[name].whole:  # it is another one, where no pixel is looked at
+                camera.state, camera.same, camera.moved = state, 1, False
+            else:
                 found.append(
                     Note(
                         "camera_frozen",
@@ -251,7 +274,7 @@ class CameraWatch:
         if camera is None:
             if len(self._cameras) >= MOST_CAMERAS:
                 self._cameras.clear()
-            self._cameras[name] = _Camera(*one, state)
+            self._cameras[name] = _Camera(one.shape, one.pixels, state)
             return True
         if camera.shape != one.shape:
             found.append(
@@ -262,10 +285,12 @@ class CameraWatch:
                     f"{camera.shape[1]} x {camera.shape[0]}",
                 )
             )
-            self._cameras[name] = _Camera(*one, state)
+            self._cameras[name] = _Camera(one.shape, one.pixels, state)
             return True
         if camera.pixels == one.pixels:
             camera.same += 1
+            if camera.same == 2:
+                camera.whole = one.whole
             return False
         camera.pixels, camera.state, camera.same, camera.moved = one.pixels, state, 1, False
         return True

@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 
 from turbopi.policy.watch import READING, Reading, Watch
-from turbopi.realtime.messages import MAX_STEP, NOTES, PREFIX, SCHEDULING_KEYS, Note, as_number, notes_in
+from turbopi.realtime.messages import MAX_STEP, MOST_NOTES, NOTES, PREFIX, SCHEDULING_KEYS, Note, as_number, notes_in
 from turbopi.realtime.wire import Unpacker, WireError
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.metrics import Metrics
@@ -315,7 +315,7 @@ class RequestHandler:
         timing = sum_timings([run.answer.get(TIMING, {}) for run in runs if run.answer is not None])
         stacked = {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
         noted = [{**note.plain, "row": row} for row, answer in enumerate(answers) for note in notes_in(answer)]
-        return {**stacked, NOTES: noted} if noted else stacked
+        return {**stacked, NOTES: noted[:MOST_NOTES]} if noted else stacked
 
 
 def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
