@@ -1,51 +1,59 @@
-"""A robot's control loop over openpi's own client: ask for a chunk, carry out its first actions, ask again.
+"""A robot's control loop at a fixed rate, which never waits for the policy: RealTimeExecutor over a server.
 
-    turbopi serve --random-weights pi05_tiny &       # or your checkpoint
-    python examples/robot_loop.py
+    turbopi serve --random-weights pi05_tiny &   # or your checkpoint
+    python examples/robot_loop.py                # --execution rtc joins chunks (docs/real_time.md)
 
-The client's environment needs `pip install openpi-client typing_extensions` alone (it wants numpy < 2). The arm here is
-made up, with LIBERO's keys; put your own into `Arm`. Before it has power, read docs/safety.md.
+A server that is killed, hangs, is late or can't be reached makes the arm hold, and go on with a new observation once it
+answers again. The robot's computer needs no PyTorch: docs/real_time.md says what to install there. With the GPU in the
+same machine, put a UnifiedPolicy in the client's place. The arm here is made up, with LIBERO's keys; put your own into
+`Arm`. Before it has power, read docs/safety.md.
 """
 
 import argparse
+import contextlib
 import time
 
 import numpy as np
-from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
-HZ = 20  # control steps a second
-EXECUTED = 5  # actions of a chunk, before the next one is asked for
+from turbopi.realtime import RealTimeClient, RealTimeExecutor, ServerLost
+from turbopi.support.errors import TurboPiError
+
+# What to command when there is no action. LIBERO's actions are movements, so the arm stays where it is with zeros; NaN
+# keeps the gripper's last command. For absolute positions leave hold_action out, and give the executor max_jump.
+HOLD = np.array([0.0] * 6 + [np.nan])
 
 
 class Arm:
-    """What a robot must be able to do: look, and carry out one action."""
+    """What a robot must be able to do: look, carry out one action, and stay where it is."""
+
+    LOWEST, HIGHEST = np.full(6, -2.0), np.full(6, 2.0)  # your limits: nobody else knows them
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
-        self._state = np.zeros(8)
+        self._pose = np.zeros(6)
 
     def observe(self) -> dict[str, object]:
         return {
             "observation/image": self._random.integers(0, 256, (224, 224, 3), dtype=np.uint8),
             "observation/wrist_image": self._random.integers(0, 256, (224, 224, 3), dtype=np.uint8),
-            "observation/state": self._state.copy(),
+            "observation/state": np.concatenate([self._pose, [0.02, -0.02]]),
             "prompt": "pick up the black bowl",
         }
 
     def move(self, action: np.ndarray) -> None:
-        self._state[:7] += 0.01 * np.clip(action, -1, 1)  # your limits: nobody else knows them
+        self._pose = np.clip(self._pose + 0.01 * np.clip(action[:6], -1, 1), self.LOWEST, self.HIGHEST)
 
     def hold(self) -> None:
         """Stay where it is."""
 
 
-def connected(host: str, port: int, patience_s: float) -> WebsocketClientPolicy:
+def connected(host: str, port: int, patience_s: float, answer_s: float) -> RealTimeClient:
     """A server takes connections once it is warm: some seconds to a minute after its start."""
     end = time.monotonic() + patience_s
     while True:
         try:
-            return WebsocketClientPolicy(host, port)
-        except ConnectionRefusedError:
+            return RealTimeClient(host, port, answer_s=answer_s)
+        except ServerLost:
             if time.monotonic() > end:
                 raise SystemExit(
                     f"no server answers at {host}:{port}; start one with: turbopi serve CHECKPOINT"
@@ -57,25 +65,46 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--host", default="localhost")
     parser.add_argument("--port", type=int, default=8000)
-    parser.add_argument("--chunks", type=int, default=4)
+    parser.add_argument("--execution", default="async", help="a way to run of docs/real_time.md")
+    parser.add_argument("--hz", type=float, default=20, help="control steps a second")
+    parser.add_argument("--steps", type=int, default=100, help="control steps until it ends")
+    parser.add_argument("--age", type=float, default=5, metavar="S", help="oldest image that may act; with a GPU: 1")
     parser.add_argument(
         "--patience", type=float, default=120, metavar="S", help="seconds that the server may take to start"
     )
     options = parser.parse_args()
-    policy, arm = connected(options.host, options.port, options.patience), Arm()
-    print("connected to a policy for", policy.get_server_metadata()["robot"])
-    for _ in range(options.chunks):
-        requested = time.monotonic()
-        try:
-            answer = policy.infer(arm.observe())
-        except RuntimeError as error:  # the server says why there are no actions
-            arm.hold()
-            raise SystemExit(f"no actions: {error}") from error
-        print(f"{len(answer['actions'])} actions after {1e3 * (time.monotonic() - requested):.0f} ms")
-        for action in answer["actions"][:EXECUTED]:
-            arm.move(action)
-            time.sleep(1 / HZ)
-    arm.hold()
+    arm = Arm()
+    try:
+        with (
+            connected(options.host, options.port, options.patience, options.age) as policy,
+            RealTimeExecutor(
+                policy,
+                control_hz=options.hz,
+                execution=options.execution,
+                hold_action=HOLD,
+                max_observation_age_s=options.age,
+            ) as executor,
+            contextlib.suppress(KeyboardInterrupt),
+        ):
+            print(f"warm after {executor.warm_up(arm.observe()):.1f} s")  # the arm stands still here
+            tick, kind = time.monotonic(), ""
+            for step in range(options.steps):
+                if executor.wants_observation:  # the images of other steps wouldn't be used
+                    executor.observe(arm.observe())
+                command = executor.next_action()  # never waits for the policy; the log says why there is no action
+                if command.kind != kind:
+                    kind = command.kind
+                    print(f"step {step}: commands are {kind}")
+                if command.action is not None:
+                    arm.move(command.action)
+                tick += 1 / options.hz
+                time.sleep(max(0.0, tick - time.monotonic()))
+    except TurboPiError as error:  # before the first action: the wrong robot, a policy that is too slow
+        raise SystemExit(str(error)) from error
+    finally:
+        arm.hold()  # after Ctrl-C, too
+    report = executor.report()
+    print(f"{report['chunks']} chunks, commands {report['commands']}, dropped {report['dropped']}")
 
 
 if __name__ == "__main__":

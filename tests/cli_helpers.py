@@ -46,10 +46,12 @@ def refusal(result: Result, *, whole: bool = True) -> str:
 
 def check_help(command: Any, *words: str) -> None:
     """That `turbopi WORDS --help` cuts or breaks no word of its options and examples at the terminal's 80 columns."""
-    output = turbopi(*words, "--help").stdout
+    names = {name for one in command.params for name in one.opts}
+    output = turbopi(*words, "--help-all" if "--help-all" in names else "--help").stdout
     lines = re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
     assert max(map(len, lines)) <= 80
     found = text_of(output).split()
+    found += [word.rstrip(",") for word in found]
     for one in command.get_params(typer.Context(command)):
         if not getattr(one, "hidden", False):
             said = [one.metavar or "", getattr(one, "help", None) or ""]

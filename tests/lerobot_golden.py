@@ -66,7 +66,7 @@ class GoldenCase:
         inputs, expected = np.load(self.folder / "inputs.npz"), np.load(self.folder / "expected.npz")
         policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", tokenizer=TINY_TOKENIZER)
         opened = open_checkpoint(checkpoint)
-        model = Pi0Model.from_state(opened.config.model, opened.load("cpu", "f32").state)
+        model = Pi0Model.from_state(opened.config.planned_model, opened.load("cpu", "f32").state)
         found: dict[str, float] = {}
         for index, run in enumerate(described["runs"]):
             theirs = {key.split("/", 1)[1]: expected[key] for key in expected.files if key.startswith(f"{index}/")}

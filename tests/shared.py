@@ -26,7 +26,7 @@ if not torch.cuda.is_available():
     os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # no processes that import PyTorch once more, to compile
     torch.set_num_threads(1)  # scripts/test runs two processes on two cores
 
-from turbopi.config import PRESETS, Kind
+from turbopi.config import PRESETS, PiKind
 from turbopi.models.pi0.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
@@ -77,9 +77,9 @@ def golden_cases() -> dict[str, Case]:
 
 
 @lru_cache
-def golden_model(kind: Kind, precision: FloatPrecision = "f32") -> Pi0Model:
+def golden_model(kind: PiKind, precision: FloatPrecision = "f32") -> Pi0Model:
     checkpoint = golden_folder().checkpoint(kind)
-    return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
+    return Pi0Model.from_state(checkpoint.config.planned_model, checkpoint.load(torch.device("cpu"), precision).state)
 
 
 @pytest.fixture

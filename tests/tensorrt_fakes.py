@@ -15,7 +15,7 @@ from turbopi.backends.tensorrt.cache import EngineCache, Environment
 from turbopi.backends.tensorrt.engine import Specification
 from turbopi.backends.tensorrt.engines import ModelEngines
 from turbopi.backends.tensorrt.ops import TORCH_DTYPES, TorchOps
-from turbopi.config import Kind
+from turbopi.config import PiKind
 from turbopi.engine.weights import Weights
 from turbopi.support.errors import BackendError
 
@@ -100,13 +100,13 @@ def on_references(cls: type[TensorRTBackend], folder: Path, *, half: bool = Fals
     return OnReferences
 
 
-def golden_load(kind: Kind) -> LoadState:
+def golden_load(kind: PiKind) -> LoadState:
     checkpoint = golden_folder().checkpoint(kind)
     return lambda device, precision: checkpoint.load(device, precision).state
 
 
-def golden_backend(cls: type[TensorRTBackend], kind: Kind, folder: Path, *, half: bool = False) -> Any:
-    config = golden_folder().checkpoint(kind).config.model
+def golden_backend(cls: type[TensorRTBackend], kind: PiKind, folder: Path, *, half: bool = False) -> Any:
+    config = golden_folder().checkpoint(kind).config.planned_model
     precision: Precision = "bf16" if half else "f32"
     backend = on_references(cls, folder, half=half)
     return backend(config, golden_load(kind), device=torch.device("cpu"), precision=precision)

@@ -20,7 +20,7 @@ CPU = torch.device("cpu")
 
 def create(name: str, precision: FloatPrecision = "f32") -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
-    model = checkpoint.config.model
+    model = checkpoint.config.planned_model
     return backends.create(
         name, model, lambda to, mode: checkpoint.load(to, mode).state, device=CPU, precision=precision
     )

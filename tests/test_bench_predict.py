@@ -175,7 +175,7 @@ def test_a_batch_that_nobody_measured_has_a_floor_and_no_call() -> None:
 
 
 def test_a_smaller_model_has_a_floor_and_no_call() -> None:
-    for one in predict(find_gpu("h200"), preset("pi05_tiny").model, Job()):
+    for one in predict(find_gpu("h200"), preset("pi05_tiny").planned_model, Job()):
         assert one.calls == []
 
 

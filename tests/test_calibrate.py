@@ -51,7 +51,7 @@ from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 pytestmark = pytest.mark.usefixtures("two_layers")
 
-TINY = TWO_LAYERS.model
+TINY = TWO_LAYERS.planned_model
 
 
 @lru_cache
@@ -604,12 +604,14 @@ def test_a_file_keeps_its_identity(tmp_path: Path) -> None:
 def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
     calibration = golden_calibration(golden_folder(), "pi0", torch.device("cpu"), 0.0)
     assert calibration.report["observations"]["source"] == "the golden cases themselves"
-    calibration.check(golden_folder().checkpoint("pi0").config.model, golden_folder().checkpoint("pi0").fingerprint())
+    calibration.check(
+        golden_folder().checkpoint("pi0").config.planned_model, golden_folder().checkpoint("pi0").fingerprint()
+    )
     case = golden_cases()["p0_pi0_state"]
     checkpoint = golden_folder().checkpoint("pi0")
     runner = backends.create(
         "pytorch",
-        checkpoint.config.model,
+        checkpoint.config.planned_model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=torch.device("cpu"),
         precision="bf16",
@@ -684,7 +686,7 @@ def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
+def test_a_certificate_is_made_on_what_was_not_calibrated_on_and_says_so(tmp_path: Path) -> None:
     checkpoint = random_checkpoint("pi05_tiny")
     policy = UnifiedPolicy(shipped.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
     for number in range(2):
@@ -693,9 +695,12 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     seen = [sample.sha256 for sample in read_examples(policy, str(tmp_path), 2)[1]]
     report = {"observations": {"source": "x", "calibration": {"1": seen[1], "other": "0" * 64}}, "warnings": []}
     arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
-    plan = VerifyPlan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
-    document = verify(checkpoint, plan)
-    assert document.observations.calibrated_on == 1
+    arguments |= {"quantization": made_up(report=report)}
+    for count in (None, 1):
+        document = verify(checkpoint, VerifyPlan(arguments, tmp_path, count, noises=1))
+        assert (document.observations.calibrated_on, document.observations.names) == (0, ["0.npz"])
+    document = verify(checkpoint, VerifyPlan(arguments, tmp_path, 2, noises=1))
+    assert (document.observations.calibrated_on, document.observations.names) == (1, ["0.npz", "1.npz"])
     assert document.calibrated is not None and document.calibrated["observations"] == "x"
 
 

@@ -43,7 +43,7 @@ def test_a_presets_edges_are_kept_and_its_sizes_are_not() -> None:
     assert config.robot == "libero"
     assert config.discrete_state_input is False
     assert config.model.action_horizon == preset.model.action_horizon == 10
-    assert config.model.vlm.width == 96
+    assert config.planned_model.vlm.width == 96
 
 
 @pytest.mark.parametrize("config", ["pi05_liber0", "", "somewhere/else", 5, None])
@@ -83,7 +83,7 @@ def test_every_key_of_turbopi_json_reaches_the_config(tmp_path: Path) -> None:
     write_json(tmp_path / "mine.json", values)
     config = open_checkpoint(PI05, str(tmp_path / "mine.json")).config
     assert config.normalization == Normalization("zscore", "quantile")
-    model = config.model
+    model = config.planned_model
     assert (model.action_horizon, model.max_prompt_tokens, model.time_grid) == (16, 64, "multiplied")
     assert model.vision.num_heads == 4
     for key in values.keys() & {field.name for field in dataclasses.fields(config)} - {"normalization"}:

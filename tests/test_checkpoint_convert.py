@@ -158,7 +158,7 @@ def test_an_unknown_precision_is_refused(tmp_path: Path) -> None:
 
 def tiny() -> Any:
     config = PRESETS["pi05_tiny"]
-    return config.with_model(vocab_size=64, vision=replace(config.model.vision, depth=1))
+    return config.with_model(vocab_size=64, vision=replace(config.planned_model.vision, depth=1))
 
 
 def test_random_weights_can_be_written_to_disk(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from safetensors.torch import load_file, save_file
 
 from turbopi.checkpoint import Checkpoint, inspect_checkpoint, open_checkpoint
 from turbopi.config import PRESETS, PolicyConfig
-from turbopi.models.pi0.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.models import parameter_shapes
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 from turbopi.support.errors import CheckpointError, ConfigError
 
 P = "paligemma_with_expert.paligemma."
@@ -67,7 +68,7 @@ def test_loaded_weights_are_the_models_own_parameters(kind: str, precision: str)
     assert {name: tuple(t.shape) for name, t in loaded.state.items()} == parameter_shapes(checkpoint.config.model)
     assert all(t.dtype == parameter_dtype(name, precision) for name, t in loaded.state.items())  # type: ignore[arg-type]
     assert loaded.bytes == sum(t.nbytes for t in loaded.state.values())
-    Pi0Model.from_state(checkpoint.config.model, loaded.state)
+    Pi0Model.from_state(checkpoint.config.planned_model, loaded.state)
 
 
 def test_bf16_rounds_to_nearest_even_and_keeps_float32_parameters_unrounded() -> None:
@@ -319,15 +320,15 @@ def test_the_unused_head_may_be_absent(tmp_path: Path, pi05: Checkpoint) -> None
 
 
 def test_jax_kernels_tell_the_vision_heads_and_torch_needs_them(tmp_path: Path, pi05: Checkpoint) -> None:
-    assert pi05.config.model.vision.num_heads == 4
+    assert pi05.config.planned_model.vision.num_heads == 4
     folder = torch_copy(tmp_path / "copy")
     (folder / "turbopi.json").unlink()
     with pytest.raises(ConfigError, match=r"64 wide, and no tensor tells its number of attention heads.*vision_heads"):
         open_checkpoint(folder, "pi05_libero")
     with pytest.raises(ConfigError, match="no tensor tells"):  # pi05_tiny is 128 wide: its 4 heads say nothing here
         open_checkpoint(folder, "pi05_tiny")
-    known = PRESETS["pi05_libero"].with_model(vision=pi05.config.model.vision)
-    assert open_checkpoint(folder, known).config.model.vision.num_heads == 4
+    known = PRESETS["pi05_libero"].with_model(vision=pi05.config.planned_model.vision)
+    assert open_checkpoint(folder, known).config.planned_model.vision.num_heads == 4
     write_json(tmp_path / "five.json", {"preset": "pi05_libero", "vision_heads": 5})
     with pytest.raises(ConfigError, match=r"vision_heads is 5, but the vision tower .* is 64 wide"):
         open_checkpoint(folder, tmp_path / "five.json")
@@ -365,7 +366,7 @@ def test_a_policy_config_is_taken_at_its_word_except_for_sizes(pi05: Checkpoint)
     mine = PolicyConfig("mine", PRESETS["pi05_droid"].model, "libero", asset_id=LIBERO)
     config = open_checkpoint(GOLDEN / "pi05" / "jax", mine).config
     assert config.model.action_horizon == 15
-    assert config.model.vlm == pi05.config.model.vlm
+    assert config.planned_model.vlm == pi05.config.planned_model.vlm
     assert config.name == "mine"
 
 

@@ -40,7 +40,7 @@ def test_a_lerobot_folder_describes_itself(tmp_path: Path) -> None:
     assert config.normalization == Normalization("lerobot_quantile", "lerobot_quantile")
     assert (config.model.action_horizon, config.model.max_prompt_tokens) == (30, 180)
     assert config.model.time_grid == "multiplied"
-    assert config.model.expert == GemmaConfig(width=32, mlp_dim=64, depth=3, head_dim=16)
+    assert config.planned_model.expert == GemmaConfig(width=32, mlp_dim=64, depth=3, head_dim=16)
     assert config.robot_options == {
         "image_keys": ["observation.images.image", "observation.images.image2"],
         "num_missing_cameras": 1,
@@ -139,7 +139,7 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"type": "pi0_fast"}, "of type 'pi0_fast'; Turbo-Pi reads LeRobot's 'pi05' and 'pi0'"),
+        ({"type": "pi0_fast"}, "of type 'pi0_fast'; Turbo-Pi reads LeRobot's 'pi05' and 'pi0' and 'smolvla'"),
         ({"type": ["pi0"]}, r"of type \['pi0'\]"),
         ({"image_resolution": [448, 448]}, r"image_resolution = \[448, 448\], which Turbo-Pi doesn't compute"),
         ({"min_period": 0.001}, "min_period = 0.001"),

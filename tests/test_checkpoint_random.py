@@ -11,12 +11,13 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import write_random
 from turbopi.checkpoint.random_weights import _BLOCK, _fill
 from turbopi.config import PRESETS
+from turbopi.models import parameter_shapes
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 from turbopi.support.errors import ConfigError
 
 PRESET = PRESETS["pi05_tiny"]
-SMALL = PRESET.with_model(vocab_size=64, vision=replace(PRESET.model.vision, depth=1))
+SMALL = PRESET.with_model(vocab_size=64, vision=replace(PRESET.planned_model.vision, depth=1))
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +133,7 @@ def test_seeds_that_are_none_are_refused(seed: object) -> None:
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 def test_activations_stay_healthy_and_the_observation_matters(kind: str) -> None:
     config = PRESET.with_model(kind=kind)
-    model = Pi0Model.from_state(config.model, random_checkpoint(config).load("cpu", "f32").state)
+    model = Pi0Model.from_state(config.planned_model, random_checkpoint(config).load("cpu", "f32").state)
     generator = torch.Generator().manual_seed(0)
 
     def observation(seed: int) -> Observation:

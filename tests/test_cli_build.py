@@ -153,7 +153,7 @@ def test_a_gpu_that_lacks_the_precision_is_refused(
 
 
 def test_other_key_value_heads_are_refused() -> None:
-    config = golden_folder().checkpoint("pi05").config.model
+    config = golden_folder().checkpoint("pi05").config.planned_model
     two = {name: dataclasses.replace(getattr(config, name), num_kv_heads=2) for name in ("vlm", "expert")}
     with pytest.raises(BackendError, match="needs one key/value head, this model has 2"):
         TensorRTBackend(

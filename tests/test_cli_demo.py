@@ -1,6 +1,7 @@
 """`turbopi demo`: the main job end to end, and a check that can fail."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -268,6 +269,11 @@ def test_the_real_time_demo_counts_what_it_played_and_says_it(tmp_path: Path) ->
         assert f"{way['success']['successes']} of 2 " in result.stderr
     assert reported["delay_costs"]["pairs"] == reported["joining_gains"]["pairs"] == 2
     assert (tmp_path / "real_time.png").exists() and (tmp_path / "commands.png").exists()
+    (order,) = re.findall(r"^By successes: (.*)\.$", result.stderr, re.MULTILINE)
+    counts = [int(count) for count in re.findall(r"\((\d+)\)", order)]
+    assert counts == sorted((way["success"]["successes"] for way in reported["ways"]), reverse=True)
+    assert "2 episodes don't tell whether there is a difference" in result.stderr
+    assert "next, with your own: turbopi inspect CHECKPOINT" in result.stderr
 
 
 def test_episodes_of_libero_are_few(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`turbopi doctor` and `turbopi backends`."""
+"""`turbopi doctor`."""
 
 import json
 import socket
@@ -11,6 +11,7 @@ import pytest
 import torch
 from cli_helpers import refusal, turbopi
 
+from turbopi import backends
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import write_random
 from turbopi.cli import checkups, gpu_checkups
@@ -180,7 +181,7 @@ def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) 
     reason = "torch.compile needs a C++ compiler on a CPU; install g++"
     monkeypatch.setattr(PyTorchCompileBackend, "unavailable", classmethod(lambda cls, device: reason))
     monkeypatch.setenv("COLUMNS", "160")
-    result = turbopi("backends", "--device", "cpu", "--json")
+    result = turbopi("doctor", "--device", "cpu", "--json")
     document = json.loads(result.stdout)
     assert (document["device"], document["auto"]) == ("cpu", "pytorch")
     by_name = {entry["name"]: entry for entry in document["backends"]}
@@ -189,11 +190,17 @@ def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) 
     assert by_name["pytorch"]["precisions"] == ["bf16", "f32"]
     assert by_name["pytorch_compile"]["available"] is False
     assert by_name["pytorch_compile"]["reason"] == reason
-    shown = turbopi("backends", "--device", "cpu").stdout
+    shown = turbopi("doctor", "--device", "cpu").stdout
     assert reason in shown
     assert "auto takes pytorch in bf16: on a CPU the eager reference starts at once" in shown
 
 
+def test_the_old_name_of_the_list_of_backends_works_for_one_version() -> None:
+    result = turbopi("backends", "--device", "cpu", "--json")
+    assert [one["name"] for one in json.loads(result.stdout)["backends"]] == list(backends.known())
+    assert "note: `turbopi doctor` has this list, too" in result.stderr
+
+
 def test_backends_refuses_what_it_cannot_list() -> None:
-    assert "unknown device 'tpu'" in refusal(turbopi("backends", "--device", "tpu"))
-    assert "unknown precision 'fp7'; choose one of bf16, f32" in refusal(turbopi("backends", "--precision", "fp7"))
+    assert "unknown device 'tpu'" in refusal(turbopi("doctor", "--device", "tpu"))
+    assert "unknown precision 'fp7'; choose one of bf16, f32" in refusal(turbopi("doctor", "--precision", "fp7"))

@@ -46,14 +46,22 @@ COMMANDS = (
     ),
     *("eval", "compare", "backends", "doctor"),
 )
+OLD_NAMES = ("backends",)  # that work for one version
 
 
 def test_help_lists_every_command_and_the_exit_codes() -> None:
     help = text_of(turbopi("--help").stdout)
     group: Any = typer.main.get_command(app)
     assert set(COMMANDS) == set(group.commands), "a command came or went"
-    for command in COMMANDS:
+    for command in set(COMMANDS) - set(OLD_NAMES):
         assert f" {command} " in help
+    for old in OLD_NAMES:
+        assert (
+            not re.search(rf"^│ {old} ", turbopi("--help").stdout, re.MULTILINE)
+            and turbopi(old, "--help").exit_code == 0
+        )
+    for group in ("Run demo ", "Checkpoint inspect ", "Measure bench ", "Advanced plan "):
+        assert group in help
     assert "Start with `turbopi demo`: it needs no checkpoint and no GPU." in help
     assert "0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own" in help
 
@@ -73,6 +81,40 @@ def test_help_is_whole_at_eighty_columns(words: tuple[str, ...], monkeypatch: py
     check_help(group.commands[words[0]] if words else group, *words)
 
 
+def test_help_shows_what_is_common_and_all_of_it_by_topic(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    short, whole = (turbopi("serve", word) for word in ("--help", "--help-all"))
+    assert short.exit_code == whole.exit_code == 0
+    assert len(short.stdout.splitlines()) <= 75
+    assert "--host" in short.stdout and "--autoscaling" not in short.stdout
+    left = re.search(r"(\d+) more options, by topic: turbopi serve --help-all", short.stdout)
+    options = set(re.findall(r"(?:^  |, )(--[a-z-]+)", whole.stdout, re.MULTILINE))
+    shown = set(re.findall(r"(?:^  |, )(--[a-z-]+)", short.stdout, re.MULTILINE))
+    assert left is not None and shown < options and len(options - shown) == int(left[1])
+    headings = [line for line in whole.stdout.splitlines() if re.fullmatch("[A-Z][^.:;]*", line)]
+    assert headings[:2] == ["Arguments", "Network"] and headings[-1] == "Others"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_descriptions_in_help_are_wide(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    group: Any = typer.main.get_command(app)
+    names = {name for one in group.commands[command].params for name in one.opts}
+    lines = turbopi(command, "--help-all" if "--help-all" in names else "--help").stdout.splitlines()
+    wrapped = [line for line in lines if line.startswith(" " * 32) and line.strip()]
+    assert not any(line.startswith(" " * 33) for line in wrapped), "all descriptions begin in one column: 48 are theirs"
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_messages_wrap_between_words_on_a_terminal_alone(terminal: bool) -> None:
+    output, text = Output(), "word " * 30
+    output.console = Console(file=io.StringIO(), width=40, force_terminal=terminal, color_system=None)
+    output.line(text)
+    lines = output.console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert len(lines) == (4 if terminal else 1)
+    assert " ".join(" ".join(lines).split()) == text.strip()
+
+
 @pytest.mark.parametrize("command", app.registered_commands, ids=lambda command: str(command.name))
 def test_an_option_whose_value_is_called_as_itself_has_its_name_written_out(command: Any) -> None:
     """Typer 0.27 takes the name from `metavar` otherwise: `--DEVICE`."""
@@ -85,7 +127,7 @@ def test_an_option_whose_value_is_called_as_itself_has_its_name_written_out(comm
 
 @pytest.mark.parametrize("command", ["demo", "infer", "serve"])
 def test_commands_that_run_a_policy_share_its_options(command: str) -> None:
-    help = text_of(turbopi(command, "--help").stdout)
+    help = text_of(turbopi(command, "--help-all" if command == "serve" else "--help").stdout)
     shared = "random-weights weights-seed config backend precision steps device tokenizer default-prompt robot debug"
     for option in shared.split():
         assert f"--{option} " in help
@@ -191,7 +233,7 @@ def test_every_argument_of_the_policy_is_an_option_of_the_policy_commands() -> N
 
 def test_every_option_of_a_server_is_worded_as_it_is_typed() -> None:
     assert set(OF_SERVERS) == {field.name for field in fields(ServerOptions)} | {"autoscaling"}
-    shown = text_of(turbopi("serve", "--help").stdout)
+    shown = text_of(turbopi("serve", "--help-all").stdout)
     assert not [option for option in (*OF_POLICIES.values(), *OF_SERVERS.values()) if option not in shown]
 
 

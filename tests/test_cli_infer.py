@@ -141,6 +141,18 @@ def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: P
     np.testing.assert_array_equal(actions_in(tmp_path), chunks[0])
 
 
+def test_actions_replace_earlier_ones_with_a_note_and_no_other_file(npz: Path, tmp_path: Path) -> None:
+    assert "replaced" not in infer(tmp_path, npz, "--no-plot").output
+    again = infer(tmp_path, npz, "--no-plot")
+    assert f"note: {tmp_path}/actions.npz is there, and is replaced; --out names another file" in again.output
+    mine = tmp_path / "mine.npz"
+    np.savez(mine, actions=np.zeros(3))
+    refused = refusal(turbopi("infer", *TINY, npz, "-o", mine))
+    assert refused == f"{mine} is there and isn't what `turbopi infer` wrote, so it isn't replaced; name another file"
+    with np.load(mine) as archive:
+        assert archive["actions"].shape == (3,)
+
+
 def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "by hand"
     folder.mkdir()
@@ -296,7 +308,7 @@ def test_a_state_in_other_units_than_the_training_datas_is_doubted(tmp_path: Pat
     np.savez(file, **seen | {"observation/state": np.degrees(seen["observation/state"])})
     result = turbopi("infer", *options, "--json")
     shown = " ".join(result.stderr.split())
-    assert shown.count("note:") == 1
+    assert shown.count("degrees.npz: the state is far") == 1
     assert re.search(r"note: .*degrees.npz: the state is far .*: x is .*, in the training data .* units", shown)
     ((note,),) = json.loads(result.stdout)["notes"]
     assert note["kind"] == "state_range" and note["names"][0] == "x"

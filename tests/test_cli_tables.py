@@ -93,7 +93,6 @@ TINY = ("--random-weights", "pi05_tiny")
     [
         ("infer", *TINY, "OBSERVATION", "--steps", "1"),
         ("inspect", "--random-weights", "pi05_libero"),
-        ("backends", "--device", "cpu"),
         ("verify", *TINY, "--backend", "pytorch", "--precision", "bf16", "--count", "1", "--noises", "1"),
         ("demo", "--episodes", "0", "--frames", "2", "--steps", "1"),
         ("bench", *TINY, "--calls", "1", "--no-error", "--steps", "1", "--device", "cpu"),

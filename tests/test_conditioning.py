@@ -301,7 +301,7 @@ def test_identity_guidance_is_lerobots(tmp_path: Path) -> None:
     checkpoint = case.assemble(tmp_path)
     policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", tokenizer=TINY_TOKENIZER)
     opened = open_checkpoint(checkpoint)
-    model = Pi0Model.from_state(opened.config.model, opened.load("cpu", "f32").state)
+    model = Pi0Model.from_state(opened.config.planned_model, opened.load("cpu", "f32").state)
     inputs, stored = np.load(GOLDEN / "rtc/inputs.npz"), np.load(GOLDEN / "rtc/rtc.npz")
     observation = _observation(inputs, 0)
     cache = model.prefix(Observation.stack([policy.prepare(observation)]))

@@ -12,13 +12,19 @@ from cli_helpers import turbopi
 
 from turbopi.cli import app
 
-pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
+pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots", "unread_settings")
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 GROUP = typer.main.get_command(app)
 _BLOCK = re.compile(r"^```[a-z]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"`turbopi ([^`]+)`")
+
+
+@pytest.fixture
+def unread_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The documents' `--settings robot.toml` isn't here."""
+    monkeypatch.setattr("turbopi.cli.settings._use", lambda *_: None)
 
 
 def commands(document: Path) -> Iterator[list[str]]:
@@ -83,7 +89,7 @@ def test_every_command_in_the_text_exists_with_its_options(document: str, line: 
 def needs_nothing(words: list[str]) -> bool:
     """Whether a command runs anywhere in a minute: no checkpoint, no GPU, no second program."""
     reckons = "--predict" in words[:-1] or (words[0] == "plan" and "--gpu" in words)
-    return words in (["backends"], ["doctor"]) or "pi05_tiny" in words or reckons
+    return words == ["doctor"] or "pi05_tiny" in words or reckons
 
 
 @pytest.mark.slow

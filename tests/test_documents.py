@@ -76,8 +76,11 @@ def test_no_figure_is_said_to_have_no_result_file(document: Path) -> None:
 def test_documents_for_users_stay_short() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(readme.splitlines()) <= 120
-    users = [readme, *(file.read_text(encoding="utf-8") for file in (ROOT / "docs").glob("*.md"))]
-    assert sum(len(text.split()) for text in users) <= 32_000
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md"]
+    words = {page: len(page.read_text(encoding="utf-8").split()) for page in pages}
+    users = len(readme.split()) + sum(count for page, count in words.items() if page.parent == ROOT / "docs")
+    assert users <= 33_500  # 32,000 of Pi0 and Pi0.5, and what replay, notes on calls, ROS 2 and SmolVLA need
+    assert len(readme.split()) + sum(words.values()) <= 55_000
 
 
 def test_the_glossary_has_each_word_once_in_order() -> None:

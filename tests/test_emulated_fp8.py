@@ -13,7 +13,7 @@ from test_engine_batch import observations
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.config import Kind
+from turbopi.config import PiKind
 from turbopi.engine.emulate import RoundedWeights, input_rounding, rounded
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.policy.policy import UnifiedPolicy
@@ -31,7 +31,7 @@ STEPS = 2
 
 
 @lru_cache
-def calibrated(kind: Kind, numbers: Numbers) -> Quantization:
+def calibrated(kind: PiKind, numbers: Numbers) -> Quantization:
     return golden_calibration(golden_folder(), kind, CPU, format=FORMATS[numbers])
 
 
@@ -44,7 +44,7 @@ def emulated(quantization: Quantization, tier: Tier) -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
     return backends.create(
         f"emulated_{format_of(tier).name}",
-        checkpoint.config.model,
+        checkpoint.config.planned_model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=CPU,
         precision=tier,
@@ -77,7 +77,7 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", FORMATS)
 def test_golden_cases_hold(numbers: Numbers, monkeypatch: pytest.MonkeyPatch) -> None:
-    def known(folder: GoldenFolder, kind: Kind, device: torch.device, format: Format) -> Quantization:
+    def known(folder: GoldenFolder, kind: PiKind, device: torch.device, format: Format) -> Quantization:
         return calibrated(kind, format.name)  # measured once
 
     monkeypatch.setattr("turbopi.verify.check_golden.golden_calibration", known)

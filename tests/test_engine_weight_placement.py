@@ -12,7 +12,7 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.config import PRESETS
 from turbopi.engine.weight_placement import GATE_UP, WeightPlacement, is_conditioning, join, joined_with
 from turbopi.engine.weights import Weights, pack
-from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.models import parameter_shapes
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 CONFIG = PRESETS["pi05_tiny"].with_model(vocab_size=64)
@@ -24,8 +24,8 @@ def nothing(name: str) -> bool:
 
 def packed(on_host: Callable[[str], bool] = nothing) -> tuple[Weights, dict[str, Tensor]]:
     """Of a placement, and the state as it was read."""
-    state = random_checkpoint(CONFIG).load(WeightPlacement(CONFIG.model, CPU, on_host), "bf16").state
-    return pack(CONFIG.model, dict(state)), state
+    state = random_checkpoint(CONFIG).load(WeightPlacement(CONFIG.planned_model, CPU, on_host), "bf16").state
+    return pack(CONFIG.planned_model, dict(state)), state
 
 
 def matrices(layer: Any) -> list[Tensor]:
@@ -35,7 +35,7 @@ def matrices(layer: Any) -> list[Tensor]:
 
 def test_packed_weights_are_those_of_tensors_apart() -> None:
     found, _ = packed()
-    plain = pack(CONFIG.model, random_checkpoint(CONFIG).load("cpu", "bf16").state)
+    plain = pack(CONFIG.planned_model, random_checkpoint(CONFIG).load("cpu", "bf16").state)
     for a, b in zip([*found.vlm, *found.expert], [*plain.vlm, *plain.expert], strict=True):
         assert all(torch.equal(x, y) for x, y in zip(matrices(a), matrices(b), strict=True))
     pairs: Any
@@ -55,17 +55,17 @@ def test_what_is_joined_is_where_it_was_read_to() -> None:
 
 
 def test_tensors_lie_where_the_room_has_them() -> None:
-    placement = WeightPlacement(CONFIG.model, META, lambda name: is_conditioning(CONFIG.model, name))
+    placement = WeightPlacement(CONFIG.planned_model, META, lambda name: is_conditioning(CONFIG.planned_model, name))
     shapes = {"time_mlp_in.weight": CPU, "expert.layers.0.input_layernorm.dense.weight": CPU, "projector.weight": META}
     for name, device in shapes.items():
         assert placement(name, (2, 3), torch.float32).device == device
-    pi0 = replace(CONFIG.model, kind="pi0")
+    pi0 = replace(CONFIG.planned_model, kind="pi0")
     assert not is_conditioning(pi0, "time_mlp_in.weight"), "which of Pi0 is a part of every step"
 
 
 def test_a_room_keeps_nothing_of_what_it_gave_away() -> None:
     """What packing rounds or drops shall be freed layer by layer, not when all is packed."""
-    placement, shapes = WeightPlacement(CONFIG.model, CPU, nothing), parameter_shapes(CONFIG.model)
+    placement, shapes = WeightPlacement(CONFIG.planned_model, CPU, nothing), parameter_shapes(CONFIG.planned_model)
     names = [f"vlm.layers.1.mlp.{part}.weight" for part in GATE_UP]
     stores = [[placement(name, shapes[name], torch.bfloat16).untyped_storage() for name in names] for _ in range(2)]
     (gate, up), (other_gate, other_up) = ([one.data_ptr() for one in some] for some in stores)
@@ -84,7 +84,7 @@ def test_a_damaged_number_is_found_wherever_it_lies(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(checkpoint.source, "pieces", damaged)
     with pytest.raises(Exception, match=r"vlm\.layers\.1\.self_attn\.k_proj\.weight"):
-        checkpoint.load(WeightPlacement(CONFIG.model, CPU, nothing), "bf16")
+        checkpoint.load(WeightPlacement(CONFIG.planned_model, CPU, nothing), "bf16")
 
 
 @pytest.mark.parametrize(

@@ -51,35 +51,42 @@ def test_every_example_says_how_to_run_it_and_is_run_here(example: Path) -> None
 
 
 @pytest.mark.parametrize("client", ["openpi's", "a stand-in"])
-def test_the_robot_loop_moves_an_arm(policy: UnifiedPolicy, client: str) -> None:
+def test_the_loop_over_openpis_client_moves_an_arm(policy: UnifiedPolicy, client: str) -> None:
     if client == "openpi's" and not CLIENT.is_file():
         pytest.skip(f"openpi-client isn't installed at {CLIENT}")
     python = CLIENT if client == "openpi's" else Path(sys.executable)
     with running(policy) as server:
-        shown = run("robot_loop.py", "--port", str(server.port), "--chunks", "2", python=python)
-    assert shown.startswith("connected to a policy for libero\n") and shown.count("10 actions after") == 2
+        shown = run("openpi_loop.py", "--port", str(server.port), "--steps", "8", "--age", "300", python=python)
+    assert shown.startswith("connected to a policy for libero\n")
+    assert sum(commands_in(shown).values()) == 8
 
 
-def test_the_real_time_loop_gives_an_arm_a_command_in_every_step(policy: UnifiedPolicy) -> None:
+def test_the_robot_loop_gives_an_arm_a_command_in_every_step(policy: UnifiedPolicy) -> None:
     with running(policy) as server:
         options = ("--hz", "2", "--steps", "8", "--age", "300")  # which of them are fresh depends on the CPU
-        shown = run("real_time_loop.py", "--port", str(server.port), *options)
-    found = re.search(r"chunks, commands ({.*}), dropped", shown)
-    assert shown.startswith("warm after ") and found is not None
-    assert sum(ast.literal_eval(found[1]).values()) == 8
+        shown = run("robot_loop.py", "--port", str(server.port), *options)
+    assert shown.startswith("warm after ")
+    assert sum(commands_in(shown).values()) == 8
 
 
 def test_the_so101_moves_by_its_own_keys() -> None:
     policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), device="cpu", robot=str(EXAMPLES / "so101.json"))
     with running(policy) as server:
-        shown = run("lerobot_so101.py", "--server", server.url, "--chunks", "2")
-    assert "the arm is at {'shoulder_pan.pos': " in shown
+        shown = run("lerobot_so101.py", "--server", server.url, "--steps", "60", "--age", "300")
+    assert sum(commands_in(shown).values()) == 60
 
 
 def test_the_so101_says_why_it_got_no_actions(policy: UnifiedPolicy) -> None:
     """A server for another robot."""
     with running(policy) as server, pytest.raises(AssertionError, match=r"no 'observation/image'.*shoulder_pan\.pos"):
-        run("lerobot_so101.py", "--server", server.url, "--chunks", "1")
+        run("lerobot_so101.py", "--server", server.url, "--steps", "1")
+
+
+def commands_in(shown: str) -> dict[str, int]:
+    found = re.search(r"commands ({[^}]*})", shown)
+    assert found is not None, shown
+    counted: dict[str, int] = ast.literal_eval(found[1])
+    return counted
 
 
 def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> None:
@@ -87,12 +94,12 @@ def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> N
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])  # free when it is closed
     requested = {
-        "robot_loop.py": ("--host", "127.0.0.1", "--port", port),
-        "real_time_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "300"),
+        "openpi_loop.py": ("--host", "127.0.0.1", "--port", port),
+        "robot_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "300"),
         "lerobot_so101.py": ("--server", f"ws://127.0.0.1:{port}"),
     }
     for name, where in requested.items():
-        with pytest.raises(AssertionError, match=r"no server answers at .*; start one with: turbopi serve") as failed:
+        with pytest.raises(AssertionError, match=r"no server answers .*; start one with: turbopi serve") as failed:
             run(name, *where, "--patience", "0")
         assert "Traceback" not in str(failed.value)
 

@@ -61,7 +61,7 @@ def documented(site: Path) -> Path:
 
 
 def test_the_documented_backend_is_listed_and_runs(documented: Path) -> None:
-    listed = json.loads(turbopi("backends", "--device", "cpu", "--json").stdout)["backends"]
+    listed = json.loads(turbopi("doctor", "--device", "cpu", "--json").stdout)["backends"]
     (noted,) = (one for one in listed if one["name"] == "noted")
     assert (
         noted["available"]
@@ -116,7 +116,7 @@ def test_a_broken_backend_is_named_and_skipped(site: Path, value: str) -> None:
     (site / "toy_exits.py").write_text("import sys\nsys.exit(3)\n")
     toy(site, extensions.BACKENDS, f'broken = "{value}"')
     why = BROKEN[value].format(f"entry point 'broken' = '{value}' in turbopi.backends, of toy 1.0")
-    listed = turbopi("backends", "--device", "cpu", "--json")
+    listed = turbopi("doctor", "--device", "cpu", "--json")
     assert listed.exit_code == 0 and f"warning: skipped: {why}" in listed.stderr
     assert [one["name"] for one in json.loads(listed.stdout)["backends"]] == list(backends.BACKENDS)
     with pytest.raises(BackendUnavailable, match=re.escape(why)):

@@ -45,7 +45,7 @@ from turbopi.support.errors import TurboPiError
 
 FACTOR = float(os.environ.get("TURBOPI_FUZZ", "1"))
 MAX_GROWTH = 700 * 2**20  # of memory, by a target with all of its damages
-TINY = preset("pi05_tiny").model
+TINY = preset("pi05_tiny").planned_model
 
 
 # -- what is read ------------------------------------------------------------------------------------------------------
@@ -73,7 +73,7 @@ def _features(checkpoint: Checkpoint) -> Iterator[tuple[str, Any]]:
 
 def _sound(checkpoint: Checkpoint) -> None:
     """Sizes within the limits, and no action mirrored or blown up by its statistics."""
-    model = checkpoint.config.model
+    model = checkpoint.config.planned_model
     for name in ("action_horizon", "action_dim", "max_prompt_tokens"):
         assert 1 <= getattr(model, name) <= LIMITS[name]
     assert 1 <= checkpoint.config.num_denoising_steps <= LIMITS["num_denoising_steps"]

@@ -14,7 +14,7 @@ from conftest import GOLDEN, golden_cases, golden_folder, golden_model
 from test_engine import made_up, send
 
 from turbopi import backends
-from turbopi.config import ImageResize, Kind
+from turbopi.config import ImageResize, PiKind
 from turbopi.engine import forward
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
@@ -50,7 +50,7 @@ def cut_vision(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @lru_cache
-def backend(name: str, kind: Kind, precision: FloatPrecision) -> backends.Backend:
+def backend(name: str, kind: PiKind, precision: FloatPrecision) -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     device = torch.device("cuda", 0)
     with pytest.MonkeyPatch.context() as patched:
@@ -58,7 +58,7 @@ def backend(name: str, kind: Kind, precision: FloatPrecision) -> backends.Backen
             patched.setenv("TURBOPI_KERNELS", "portable")
         return backends.create(
             "fused" if name == PORTABLE else name,
-            checkpoint.config.model,
+            checkpoint.config.planned_model,
             lambda to, mode: checkpoint.load(to, mode).state,
             device=device,
             precision=precision,
@@ -90,7 +90,7 @@ def test_repetition_is_bit_identical(name: str, precision: FloatPrecision) -> No
 
 @pytest.mark.parametrize("name", GRAPHS)
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
-def test_every_prompt_length_in_a_bucket_is_right(name: str, kind: Kind) -> None:
+def test_every_prompt_length_in_a_bucket_is_right(name: str, kind: PiKind) -> None:
     """Long and short prompts in turn: what a longer one left in the cache must not be seen by a shorter one."""
     case = golden_cases()["a_three_cams" if kind == "pi05" else "p0_pi0_state"]
     reference, runner = backend("pytorch", kind, "f32"), backend(name, kind, "bf16")
@@ -173,7 +173,7 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
     checkpoint = golden_folder().checkpoint("pi05")
     runner: Any = backends.create(
         name,
-        checkpoint.config.model,
+        checkpoint.config.planned_model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=torch.device("cuda", 0),
         precision="bf16",
@@ -260,7 +260,7 @@ def test_tf32_stays_out_of_the_oracle_whatever_the_caller_has_set() -> None:
 @pytest.mark.parametrize(("name", "precision"), [mode for mode in MODES if mode[0] in GRAPHS])
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 @pytest.mark.parametrize("which", [*BY_TOKEN, "jacobian", "jacobian_and_held"])
-def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecision, kind: Kind, which: str) -> None:
+def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecision, kind: PiKind, which: str) -> None:
     """Plain calls beside them keep their bits."""
     runner: Any = backend(name, kind, precision)
     observation, noise = made_up(kind, 2, 19)
@@ -340,7 +340,7 @@ def test_a_batch_of_conditioned_observations_equals_its_rows(name: str, count: i
 
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
 @pytest.mark.parametrize("which", ["held_and_identity", "staircase", "jacobian"])
-def test_a_conditioned_batch_in_float32_is_the_references(kind: Kind, which: str) -> None:
+def test_a_conditioned_batch_in_float32_is_the_references(kind: PiKind, which: str) -> None:
     runner: Any = backend("cuda_graph", kind, "f32")
     one, noise = made_up(kind, 2, 19)
     other, _ = made_up(kind, 1, 7, seed=1)

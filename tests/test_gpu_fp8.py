@@ -12,7 +12,7 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.backends.fused import FusedBackend
-from turbopi.config import Kind
+from turbopi.config import PiKind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
@@ -36,24 +36,24 @@ STEPS = 10
 
 
 @lru_cache
-def on_gpu(kind: Kind) -> Pi0Model:
+def on_gpu(kind: PiKind) -> Pi0Model:
     state = {name: tensor.to("cuda") for name, tensor in golden_model(kind).state_dict().items()}
     return Pi0Model.from_state(golden_model(kind).config, state)
 
 
 @lru_cache
-def quantization(kind: Kind, target: float) -> Quantization:
+def quantization(kind: PiKind, target: float) -> Quantization:
     return golden_calibration(golden_folder(), kind, torch.device("cuda", 0), target)
 
 
 @lru_cache
-def backend(kind: Kind, precision: Precision, target: float = 0.0, kernels: str = "auto") -> backends.Backend:
+def backend(kind: PiKind, precision: Precision, target: float = 0.0, kernels: str = "auto") -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TURBOPI_KERNELS", kernels)
         return backends.create(
             "fused",
-            checkpoint.config.model,
+            checkpoint.config.planned_model,
             lambda to, mode: checkpoint.load(to, mode).state,
             device=torch.device("cuda", 0),
             precision=precision,
@@ -193,7 +193,7 @@ def test_operations_have_the_expert_again_when_they_need_it() -> None:
     def fresh() -> Any:
         checkpoint = golden_folder().checkpoint("pi05")
         return FusedBackend(
-            checkpoint.config.model,
+            checkpoint.config.planned_model,
             lambda to, mode: checkpoint.load(to, mode).state,
             device=torch.device("cuda", 0),
             precision="bf16",

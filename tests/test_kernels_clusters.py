@@ -27,7 +27,7 @@ RUNS = 600
 @pytest.mark.parametrize("columns", [128, 176])  # with room for the next kernel's CTA, and without
 @pytest.mark.parametrize("fp8", [False, True])
 def test_layers_with_products_in_clusters_go_on_and_on(fp8: bool, columns: int, clusters: tuple[int, int]) -> None:
-    config, device = preset("pi05_aloha").model, torch.device("cuda", 0)
+    config, device = preset("pi05_aloha").planned_model, torch.device("cuda", 0)
     g, tile = config.expert, Tile(1, columns, *clusters, splits=2)
     assert tile.leaves_room == (columns == 128)
     key = TileKey("hopper", "parts", "fp8" if fp8 else "bf16", 448, g.width, g.num_heads * g.head_dim)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import smolvla_golden
 from checkpoint_helpers import edit_json
 from lerobot_cases import tokenizer_folder
 from lerobot_golden import GOLDEN, GoldenCase
@@ -33,7 +34,7 @@ OTHER_SIZES = (OF_0_4, "rtc")  # than the small LeRobot of tools/lerobot_cases h
 BF16 = 5e-3  # LeRobot's own bfloat16 from the float32 that is computed here; seen: half
 
 
-def in_lerobot(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+def in_lerobot(*arguments: str | Path, **more: str) -> subprocess.CompletedProcess[str]:
     """`python ARGUMENTS` with LeRobot, the plugin and the tools, offline."""
     if not PYTHON.is_file():
         hint = f"LeRobot isn't installed at {PYTHON}; scripts/lerobot_env installs it (about 3 GB)"
@@ -45,6 +46,7 @@ def in_lerobot(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
         "PYTHONPATH": os.pathsep.join(str(REPOSITORY / path) for path in paths),
         "HF_HUB_OFFLINE": "1",
         "OMP_NUM_THREADS": "1",
+        **more,
     }
     command = [str(PYTHON), *map(str, arguments)]
     return subprocess.run(
@@ -63,6 +65,35 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = in_lerobot("-m", "lerobot_cases.plugin", folder)
     assert done.returncode == 0, done.stderr[-4000:]
     return folder
+
+
+SMOLVLA = ("base", "missing_camera", "special_tokens")
+
+
+@pytest.fixture(scope="module")
+def ran_smolvla(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `ran`, of SmolVLA's cases; its tokenizer is in a Hub's cache."""
+    folder = tmp_path_factory.mktemp("smolvla")
+    hub = smolvla_golden.make_hub(tmp_path_factory.mktemp("hub"))
+    for name in SMOLVLA:
+        (folder / name).mkdir()
+        smolvla_golden.make_checkpoint(name, folder / name / "checkpoint")
+        for file in ("case.json", "inputs.npz"):
+            shutil.copy(smolvla_golden.GOLDEN / name / file, folder / name)
+    done = in_lerobot("-m", "lerobot_cases.plugin", folder, HF_HUB_CACHE=str(hub))
+    assert done.returncode == 0, done.stderr[-4000:]
+    return folder
+
+
+@pytest.mark.parametrize("name", SMOLVLA)
+def test_smolvlas_actions_are_lerobots(ran_smolvla: Path, name: str) -> None:
+    found = np.load(ran_smolvla / name / "plugin.npz")
+    stored = np.load(smolvla_golden.GOLDEN / name / "expected.npz")
+    runs = [key for key in stored.files if key.endswith("/actions")]
+    assert runs
+    for key in [*runs, "selected_actions"]:
+        steps = min(len(found[key]), len(stored[key]))
+        assert rms(found[key][:steps], stored[key][:steps]) <= 2e-5, key
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in OTHER_SIZES and "peft" not in name])

@@ -17,7 +17,7 @@ from test_lerobot_itself import PYTHON
 from torch import Tensor
 
 from turbopi.models.pi0.conditioning import GuidanceMode, guidance_strength, lerobot_guidance_weights
-from turbopi.models.pi0.denoise import Pull, guided_velocity
+from turbopi.models.pi0.integrate import Pull, guided_velocity
 
 pytestmark = pytest.mark.slow
 

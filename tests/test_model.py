@@ -13,10 +13,11 @@ from torch import Tensor
 
 import turbopi
 from turbopi.config import GemmaConfig, Kind, ModelConfig
+from turbopi.models import parameter_shapes
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.denoise import time_embedding, time_grid
 from turbopi.models.pi0.layers import attention
-from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, parameter_dtype
 from turbopi.support.errors import ConfigError, ObservationError
 
 STEPS = 3

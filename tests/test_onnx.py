@@ -29,7 +29,7 @@ from turbopi.checkpoint import open_checkpoint
 from turbopi.cli.compare import parse_variant
 from turbopi.cli.evaluate import EvalOptions
 from turbopi.cli.options import PolicyOptions
-from turbopi.config import Kind
+from turbopi.config import PiKind
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, OutputError
 from turbopi.support.installation import install_command
@@ -51,18 +51,18 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-KINDS: tuple[Kind, ...] = ("pi05", "pi0")
+KINDS: tuple[PiKind, ...] = ("pi05", "pi0")
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[Kind, Path]:
+def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[PiKind, Path]:
     """The golden weights' exports, of Pi0.5 by the backend and of Pi0 from Python; `tiny` has one by the command."""
     pi0 = export_onnx(golden_model("pi0"), tmp_path_factory.mktemp("pi0") / "exported")
     return {"pi05": Path(golden_backend().describe()["export"]), "pi0": pi0.folder}
 
 
 @pytest.fixture
-def folder(exported: dict[Kind, Path], tmp_path: Path) -> Path:
+def folder(exported: dict[PiKind, Path], tmp_path: Path) -> Path:
     """A copy of an export, to be damaged."""
     return Path(shutil.copytree(exported["pi05"], tmp_path / "copy"))
 
@@ -72,7 +72,7 @@ def opened(folder: Path) -> OnnxBackend:
     return OnnxBackend.open(folder)
 
 
-def fresh_inputs(kind: Kind, graph: str, length: int, horizon: int) -> dict[str, Tensor]:
+def fresh_inputs(kind: PiKind, graph: str, length: int, horizon: int) -> dict[str, Tensor]:
     """Random inputs of a graph, for `length` images, prompt or prefix tokens."""
     config = golden_model(kind).config
     random = torch.Generator().manual_seed(1000 * length + horizon)
@@ -103,7 +103,7 @@ def fresh_inputs(kind: Kind, graph: str, length: int, horizon: int) -> dict[str,
     }
 
 
-def reference(kind: Kind, graph: str, inputs: dict[str, Tensor]) -> list[Tensor]:
+def reference(kind: PiKind, graph: str, inputs: dict[str, Tensor]) -> list[Tensor]:
     """What the reference's own functions make of a graph's inputs."""
     from turbopi.models.pi0.denoise import suffix_mask, suffix_rope
     from turbopi.models.pi0.kv_cache import KVCache
@@ -142,7 +142,7 @@ def reference(kind: Kind, graph: str, inputs: dict[str, Tensor]) -> list[Tensor]
     ],
 )
 def test_every_graph_computes_the_reference(
-    exported: dict[Kind, Path], kind: Kind, graph: str, length: int, horizon: int
+    exported: dict[PiKind, Path], kind: PiKind, graph: str, length: int, horizon: int
 ) -> None:
     inputs = fresh_inputs(kind, graph, length, horizon)
     outputs, expected = opened(exported[kind])._sessions.run(graph, **inputs), reference(kind, graph, inputs)
@@ -153,7 +153,7 @@ def test_every_graph_computes_the_reference(
 
 
 @pytest.mark.parametrize("name", sorted(golden_cases()))
-def test_exported_folders_equal_openpi(exported: dict[Kind, Path], name: str) -> None:
+def test_exported_folders_equal_openpi(exported: dict[PiKind, Path], name: str) -> None:
     case = golden_cases()[name]
     comparisons = check_case(case, opened(exported[case.kind]))
     everything = {"prefix_embs", "kv_k", "kv_v", "v_t", "x_t", "actions"}
@@ -167,14 +167,14 @@ def golden_backend() -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
     return backends.create(
         "onnx",
-        checkpoint.config.model,
+        checkpoint.config.planned_model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=CPU,
         precision="f32",
     )
 
 
-def test_the_backend_exports_the_weights_it_is_given(exported: dict[Kind, Path]) -> None:
+def test_the_backend_exports_the_weights_it_is_given(exported: dict[PiKind, Path]) -> None:
     """Its actions are openpi's: see above."""
     case, backend = golden_cases()["b_third_masked"], golden_backend()
     sample = backend.sample(case.observation, case.noise, 3)
@@ -186,7 +186,7 @@ def test_the_backend_exports_the_weights_it_is_given(exported: dict[Kind, Path])
 
 
 def test_an_export_is_kept_for_the_next_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[Kind, Path], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[PiKind, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     """And used for what it was made of alone; what isn't whole is made anew. Here exporting is copying one."""
     made: list[Path] = []
@@ -226,7 +226,7 @@ def test_a_folder_that_keeps_nothing_is_named_with_what_to_do(tmp_path: Path, mo
 
 
 def test_the_exports_that_were_used_last_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[Kind, Path]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[PiKind, Path]
 ) -> None:
     """And what isn't an export stays."""
     place, model = tmp_path / "exports", golden_model("pi05")
@@ -249,7 +249,7 @@ def test_the_exports_that_were_used_last_are_kept(
     assert {*place.iterdir()} == {*made, newest, *others} - {made[1]}
 
 
-def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(exported: dict[Kind, Path]) -> None:
+def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(exported: dict[PiKind, Path]) -> None:
     case, backend = golden_cases()["b_third_masked"], opened(exported["pi05"])
     one = case.observation
     other = dataclasses.replace(one, image_mask=torch.tensor([[True, False, False]]), images=one.images.flip(1))
@@ -263,7 +263,7 @@ def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(ex
     torch.testing.assert_close(golden_model("pi05").sample(both, noise, 4), whole, rtol=0, atol=1e-5)
 
 
-def test_pictures_as_bytes_are_the_same_as_floats(exported: dict[Kind, Path]) -> None:
+def test_pictures_as_bytes_are_the_same_as_floats(exported: dict[PiKind, Path]) -> None:
     case, backend = golden_cases()["a_three_cams"], opened(exported["pi05"])
     pixels = torch.randint(256, case.observation.images.shape, dtype=torch.uint8)
     as_bytes = dataclasses.replace(case.observation, images=pixels)
@@ -272,7 +272,7 @@ def test_pictures_as_bytes_are_the_same_as_floats(exported: dict[Kind, Path]) ->
     assert torch.equal(*actions)
 
 
-def test_an_observation_of_nothing_is_refused(exported: dict[Kind, Path]) -> None:
+def test_an_observation_of_nothing_is_refused(exported: dict[PiKind, Path]) -> None:
     case = golden_cases()["a_three_cams"]
     masks = {name: torch.zeros_like(getattr(case.observation, name)) for name in ("image_mask", "token_mask")}
     with pytest.raises(ObservationError, match="nothing to attend to"):
@@ -374,7 +374,7 @@ def test_an_export_without_its_description_says_what_is_missing(tiny: Path, tmp_
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_folder_says_what_it_holds(exported: dict[Kind, Path], kind: Kind) -> None:
+def test_the_folder_says_what_it_holds(exported: dict[PiKind, Path], kind: PiKind) -> None:
     names = {f"{graph}.onnx{data}" for graph in exporting.GRAPHS for data in ("", ".data")}
     assert {file.name for file in exported[kind].iterdir()} == names | {MANIFEST}
     export, model = open_export(exported[kind]), golden_model(kind)
@@ -389,7 +389,7 @@ def test_the_folder_says_what_it_holds(exported: dict[Kind, Path], kind: Kind) -
     assert ("state" in step["inputs"]) == (kind == "pi0")
 
 
-def test_every_weight_is_outside_the_graph_and_no_path_is_in_it(exported: dict[Kind, Path]) -> None:
+def test_every_weight_is_outside_the_graph_and_no_path_is_in_it(exported: dict[PiKind, Path]) -> None:
     import onnx
 
     for graph in exporting.GRAPHS:
@@ -401,7 +401,7 @@ def test_every_weight_is_outside_the_graph_and_no_path_is_in_it(exported: dict[K
     onnx.checker.check_model(str(file), full_check=True)
 
 
-def test_fp8_and_fused_attention_are_not_in_the_graphs(exported: dict[Kind, Path]) -> None:
+def test_fp8_and_fused_attention_are_not_in_the_graphs(exported: dict[PiKind, Path]) -> None:
     import onnx
 
     model = onnx.load(str(exported["pi05"] / "prefix.onnx"), load_external_data=False)

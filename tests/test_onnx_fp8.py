@@ -60,7 +60,7 @@ def rounded(x: Tensor, scale: Tensor) -> Tensor:
 
 def emulated(calibration: Calibration) -> Pi0Model:
     checkpoint = golden_folder().checkpoint("pi05")
-    model = Pi0Model.from_state(checkpoint.config.model, checkpoint.load("cpu", "f32").state)
+    model = Pi0Model.from_state(checkpoint.config.planned_model, checkpoint.load("cpu", "f32").state)
     for layer, scales in zip(model.vlm.layers, calibration.scales, strict=False):
         assert scales is not None
         layer.mlp = FakeQuantGeGLU(layer.mlp, scales)  # type: ignore[assignment]

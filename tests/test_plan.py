@@ -355,6 +355,16 @@ def test_a_prediction_is_called_one() -> None:
     assert "PREDICTED" not in turbopi(*ASK, "--gpu", "h200").stdout
 
 
+def test_no_command_is_recommended_where_auto_would_not_run_it() -> None:
+    for gpu in ("rtx4090", "orin", "thor"):
+        shown = turbopi(*ASK, "--gpu", gpu).stdout
+        assert "turbopi serve" not in shown
+        assert "no command is recommended: fused was never run on a " in shown
+    assert "turbopi serve CHECKPOINT --backend fused" in turbopi(*ASK, "--gpu", "h20").stdout, "as Hopper's others"
+    chosen = turbopi(*ASK, "--gpu", "rtx4090", "--precision", "fp8").stdout
+    assert "turbopi serve CHECKPOINT --backend fused --precision fp8" in chosen, "auto takes it for FP8"
+
+
 def test_a_plan_without_times_of_batches_says_so() -> None:
     reported = (
         "Batches of such chunks weren't measured there: `turbopi bench --horizons 10 --batch 1,2,4,8`, then --times"

@@ -12,7 +12,7 @@ import torch
 from conftest import GOLDEN, golden_folder
 
 from turbopi.checkpoint import Checkpoint, load_norm_stats, open_checkpoint, random_checkpoint
-from turbopi.config import Kind, Normalization, NormMode, PolicyConfig, preset
+from turbopi.config import Normalization, NormMode, PiKind, PolicyConfig, preset
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import BackendUnavailable, ConfigError, ObservationError, TokenizerError
 
@@ -31,7 +31,7 @@ def golden_policy(name: str, **options: Any) -> tuple[UnifiedPolicy, dict[str, A
     settings = json.loads((GOLDEN / "policy/policy.json").read_text())[name]
     with np.load(GOLDEN / f"policy/{name}.npz") as archive:
         stored = {key: archive[key] for key in archive.files}
-    kind: Kind = settings["model"]
+    kind: PiKind = settings["model"]
     mode: NormMode = "quantile" if settings["quantile_norm"] else "zscore"
     aloha = settings["robot"] == "aloha"
     config = PolicyConfig(

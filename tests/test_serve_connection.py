@@ -719,3 +719,22 @@ def test_a_message_that_comes_with_the_connections_end_is_still_received() -> No
             await client.receive()
 
     run(test)
+
+
+def test_a_client_that_is_held_back_is_not_cut_for_its_silence_and_a_dead_one_is() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.connection.ping_interval = client.connection.ping_timeout = 0.001
+        client.connection.loop = asyncio.get_running_loop()
+        client.send(frame(b"request"))
+        client.connection.start_keepalive()
+        while b"\x89" not in client.transport.written:  # a ping
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.05)  # its pong stands behind what isn't read yet
+        assert client.closed_with is None
+        client.connection.answered("good")
+        while client.closed_with is None:
+            await asyncio.sleep(0.001)
+        assert client.closed_with == (1011, "keepalive ping timeout")
+
+    run(test)

@@ -265,7 +265,7 @@ def test_all_gpus_are_not_one_by_number_and_not_cpus(device: str, words: str) ->
 
 
 def test_the_help_shows_a_fleet() -> None:
-    text = text_of(turbopi("serve", "--help").stdout)
+    text = text_of(turbopi("serve", "--help-all").stdout)
     assert "--ray --gpus all" in text and "docs/fleet.md" in text
 
 

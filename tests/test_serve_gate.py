@@ -326,7 +326,7 @@ def test_a_limited_log_says_how_much_it_left_out(caplog: pytest.LogCaptureFixtur
 
 
 def test_help_shows_no_key_on_a_command_line() -> None:
-    help = text_of(turbopi("serve", "--help").stdout)
+    help = text_of(turbopi("serve", "--help-all").stdout)
     assert "--api-key-file" in help
     assert "TURBOPI_API_KEY" in help
     assert "--api-key " not in help

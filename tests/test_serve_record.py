@@ -1,7 +1,9 @@
 """Recordings: what goes in comes out, and the disk never holds the robot up."""
 
 import json
+import os
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,8 @@ from PIL import Image
 
 from turbopi.recordings import RecordedCall, Recorder, iter_recording, load_call, load_observation, save_call
 from turbopi.recordings import recorder as record
+from turbopi.recordings.format import RECORD_IMAGES, RecordImages
+from turbopi.recordings.limit import RecordLimit, Trimmed
 from turbopi.support.errors import ConfigError, ObservationError, OutputError
 from turbopi.support.files import append_line
 
@@ -144,10 +148,10 @@ class SlowDisk:
         self.writing, self.may_write = threading.Event(), threading.Event()
         monkeypatch.setattr(record, "save_call", self)
 
-    def __call__(self, path: Path, call: RecordedCall) -> None:
+    def __call__(self, path: Path, call: RecordedCall, images: RecordImages) -> None:
         self.writing.set()
         assert self.may_write.wait(30)
-        save_call(path, call)
+        save_call(path, call, images)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +163,7 @@ def test_a_slow_disk_drops_calls_with_a_counted_warning(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-    limits: dict[str, int],
+    limits: dict[str, Any],
     sizes: list[int],
 ) -> None:
     disk = SlowDisk(monkeypatch)
@@ -316,7 +320,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path: Path) -> None:
         (b"{", "damaged index"),
         (b"[]", "damaged index"),
         (b'{"format":"turbopi-recording","version":1,"time":1,"observation":[],"result":{"dict":[]}}', "damaged index"),
-        (b'{"format": "turbopi-recording", "version": 2}', "version 2; this reads turbopi-recording of version 1"),
+        (b'{"format": "turbopi-recording", "version": 3}', "version 3; this reads turbopi-recording of version 1 or 2"),
         (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"array": "x"}}', "damaged index"),
         (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"what": "x"}}', "damaged index"),
     ],
@@ -384,3 +388,109 @@ def test_a_manifest_that_cannot_be_written_ends_the_start(tmp_path: Path, monkey
     monkeypatch.setattr("turbopi.support.files.os.replace", full)
     with pytest.raises(ConfigError, match=r"manifest\.json"):
         Recorder(tmp_path, {})
+
+
+# --- images as files --------------------------------------------------------------------------------------------------
+
+
+def smooth(height: int, width: int) -> np.ndarray:
+    """uint8[h, w, 3], a gradient: JPEG keeps such images within a few of 255."""
+    rows, columns = np.mgrid[:height, :width]
+    return np.stack([rows * 255 // height, columns * 255 // width, (rows + columns) % 256 // 2], 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("images", RECORD_IMAGES)
+def test_images_come_back_in_their_layout_whatever_they_are_written_as(tmp_path: Path, images: RecordImages) -> None:
+    """Depth, masks and single channels are no images, and stay as they are."""
+    image, depth = smooth(40, 60), np.arange(12, dtype=np.uint16).reshape(3, 4)
+    kept = {
+        "depth": depth,
+        "mask": np.zeros((3, 4), np.uint8),
+        "grey": np.zeros((5, 4, 1), np.uint8),
+        "state": np.ones(8),
+    }
+    observation: dict[str, Any] = {"hwc": image, "chw": np.ascontiguousarray(image.transpose(2, 0, 1)), **kept}
+    save_call(tmp_path / "x.npz", RecordedCall(observation, RESULT, 1.0), images)
+    read = load_call(tmp_path / "x.npz")
+    assert_equal(read.result, RESULT)
+    assert_equal({key: read.observation[key] for key in kept}, kept)
+    for key in ("hwc", "chw"):
+        found, expected = read.observation[key], observation[key]
+        assert (found.dtype, found.shape) == (expected.dtype, expected.shape)
+        difference = np.abs(found.astype(int) - expected)
+        assert difference.max() <= (12 if images == "jpeg" else 0)
+    assert_equal(load_observation(tmp_path / "x.npz")["state"], np.ones(8))
+
+
+def test_a_recorded_image_that_is_damaged_is_refused(tmp_path: Path) -> None:
+    index = {
+        "format": "turbopi-recording",
+        "version": 2,
+        "time": 1.0,
+        "observation": {"dict": [["image", {"image": "x"}]]},
+        "result": {"dict": []},
+    }
+    np.savez(
+        tmp_path / "x.npz", x=np.arange(9, dtype=np.uint8), index=np.frombuffer(json.dumps(index).encode(), np.uint8)
+    )
+    with pytest.raises(ObservationError, match="x is neither a readable image"):
+        load_call(tmp_path / "x.npz")
+
+
+# --- the limit --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "limit"),
+    [
+        ("20GB", RecordLimit(20 * 10**9)),
+        ("1.5TB, 7d", RecordLimit(15 * 10**11, 7 * 86400)),
+        ("12h,300MB", RecordLimit(300 * 10**6, 12 * 3600)),
+    ],
+)
+def test_a_limit_is_a_size_an_age_or_both(text: str, limit: RecordLimit) -> None:
+    assert RecordLimit.of(text) == limit
+
+
+@pytest.mark.parametrize(
+    "text", ["", "20", "20 gigabytes", "-1GB", "0GB", "1GB,2GB", "7d,8h", "nanGB", "1e3GB", "20GiB"]
+)
+def test_what_is_no_limit_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="should be a size, an age, or both: 20GB, 7d or 20GB,7d"):
+        RecordLimit.of(text)
+
+
+def test_the_oldest_calls_of_all_runs_go_and_the_log_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    first = Recorder(tmp_path, {})
+    for number in range(3):
+        first.put({"n": number}, RESULT, size=1)
+    first.close()
+    size = (first.folder / "000000.npz").stat().st_size
+    (first.folder / "notes.txt").write_text("mine")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "000000.npz").write_bytes(bytes(10 * size))  # of no recording: there is no manifest
+    counted: list[str] = []
+    second = Recorder(tmp_path, {}, count=counted.append, limit=RecordLimit(int(3.5 * size)))
+    for number in range(3, 5):
+        second.put({"n": number}, RESULT, size=1)
+    second.close()
+    assert sorted(counted) == ["removed", "removed", "written", "written"]
+    assert [obs["n"] for obs, _ in iter_recording(first.folder)] == [2]
+    assert [obs["n"] for obs, _ in iter_recording(second.folder)] == [3, 4]
+    assert (first.folder / "notes.txt").exists() and (tmp_path / "other" / "000000.npz").exists()
+    assert "--record-limit: the 2 oldest recorded calls (0 MB) were removed; 3 calls (0 MB) are left" in caplog.text
+
+
+def test_calls_beyond_an_age_go_and_the_newest_one_stays(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "manifest.json").write_text("{}")
+    for number, days in enumerate((9, 8, 1)):
+        file = run / f"{number:06d}.npz"
+        file.write_bytes(b"x")
+        moment = time.time() - 86400 * days
+        os.utime(file, (moment, moment))
+    trimmed = Trimmed(tmp_path, RecordLimit(seconds=7 * 86400))
+    assert trimmed.trim() == 2 and [file.name for file in run.glob("*.npz")] == ["000002.npz"]
+    assert Trimmed(tmp_path, RecordLimit(bytes=0, seconds=1)).trim() == 0

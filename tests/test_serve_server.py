@@ -8,12 +8,14 @@ import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,9 +25,11 @@ from serve_fakes import NO_CHUNKS, FakePolicy, PipelinedFakePolicy, http_get, ob
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 
+from turbopi.realtime import RealTimeClient
 from turbopi.realtime.wire import pack, unpack
-from turbopi.recordings import iter_recording
-from turbopi.serve import PolicyServer, running
+from turbopi.recordings import iter_recording, load_call
+from turbopi.serve import PolicyServer, ServerOptions, running
+from turbopi.serve.launch import addresses
 from turbopi.serve.limits import Limits
 from turbopi.serve.server import SWITCH_SECONDS
 from turbopi.support.errors import ConfigError, DeviceLost
@@ -835,3 +839,51 @@ def test_a_folder_that_cannot_be_recorded_into_is_said_at_the_start(tmp_path: Pa
         running(FakePolicy(), record_dir=tmp_path / "file"),
     ):
         pass
+
+
+def test_a_recording_has_its_limit_and_its_kind_of_images(tmp_path: Path) -> None:
+    image = np.full((4, 4, 3), 7, np.uint8)
+    keys = {"observation/state": np.linspace(-1, 1, 8), "observation/image": image}
+    options: dict[str, Any] = {"record_dir": tmp_path, "record_limit": "1d", "record_images": "png"}
+    with running(FakePolicy(), **options) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        client.infer(keys)
+    (file,) = tmp_path.glob("*/000000.npz")
+    np.testing.assert_array_equal(load_call(file).observation["observation/image"], image)
+    with np.load(file) as members:
+        assert members["observation/observation/image"].tobytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"record_limit": "1d"}, "record_limit= and record_images= are of a recording: give record_dir=, too"),
+        ({"record_dir": "x", "record_limit": "much"}, "record_limit='much' should be a size, an age, or both"),
+        ({"record_dir": "x", "record_images": "gif"}, "record_images='gif' should be one of exact, png, jpeg"),
+    ],
+)
+def test_options_of_a_recording_that_cannot_be_right_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        ServerOptions(**options)
+
+
+def test_addresses_of_a_server_on_all_interfaces_can_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    def address(family: socket.AddressFamily, text: str) -> Any:
+        return SimpleNamespace(family=family, address=text)
+
+    interfaces = {
+        "lo": [address(socket.AF_INET, "127.0.0.1"), address(socket.AF_INET6, "::1")],
+        "eth0": [
+            address(socket.AF_INET, "192.168.1.20"),
+            address(socket.AF_INET6, "fe80::1%eth0"),
+            address(socket.AF_INET6, "fd00::2"),
+            address(socket.AF_PACKET, "00:11:22:33:44:55"),
+        ],
+        "down": [address(socket.AF_INET, "10.0.0.1")],
+    }
+    monkeypatch.setattr("psutil.net_if_addrs", lambda: interfaces)
+    monkeypatch.setattr(
+        "psutil.net_if_stats", lambda: {name: SimpleNamespace(isup=name != "down") for name in interfaces}
+    )
+    assert addresses("0.0.0.0") == ["192.168.1.20", "localhost"]
+    assert addresses("::") == ["192.168.1.20", "[fd00::2]", "localhost"]
+    assert addresses("192.168.1.20") == addresses("localhost") == []

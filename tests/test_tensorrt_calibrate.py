@@ -28,7 +28,7 @@ def observations() -> list[Observation]:
 
 def own_model() -> Pi0Model:
     checkpoint = golden_folder().checkpoint("pi05")
-    return Pi0Model.from_state(checkpoint.config.model, checkpoint.load("cpu", "f32").state)
+    return Pi0Model.from_state(checkpoint.config.planned_model, checkpoint.load("cpu", "f32").state)
 
 
 def test_scales_are_the_largest_magnitudes_over_448() -> None:

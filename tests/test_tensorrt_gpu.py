@@ -46,7 +46,7 @@ def gpu() -> torch.device:
 
 def made(name: str, kind: str = "pi05") -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)  # type: ignore[arg-type]
-    config = checkpoint.config.model
+    config = checkpoint.config.planned_model
     return backends.create(
         name, config, lambda to, mode: checkpoint.load(to, mode).state, device=gpu(), precision="bf16"
     )

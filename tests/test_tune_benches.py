@@ -32,7 +32,7 @@ from turbopi.tune.shapes import Call, Operation, operations
 
 CPU = torch.device("cpu")
 SMS = 132
-FULL = preset("pi05_libero").model
+FULL = preset("pi05_libero").planned_model
 pytestmark = [pytest.mark.filterwarnings(f"ignore::{one}") for one in ("RuntimeWarning", "DeprecationWarning")]
 
 
@@ -332,7 +332,9 @@ def test_the_towers_products_are_measured_in_the_form_that_they_run_in() -> None
 def test_the_experts_layers_are_those_of_a_denoising_step(name: str, numbers: Any) -> None:
     """Finite, of the operations' sizes, and each of them as often as a layer has it."""
     expert = replace(FULL.expert, depth=2, width=64, mlp_dim=96, num_heads=2, head_dim=64)
-    config = replace(preset(name).model, expert=expert, vlm=replace(FULL.vlm, depth=2, head_dim=64, num_heads=2))
+    config = replace(
+        preset(name).planned_model, expert=expert, vlm=replace(FULL.vlm, depth=2, head_dim=64, num_heads=2)
+    )
     tokens, of_state = 4, name == "pi0_libero"
     found = [one for one in operations(config, Call(1, 16, 3), numbers, "hopper", horizon=tokens) if one.in_layers]
     assert {LayersOf.of(one) for one in found} == {

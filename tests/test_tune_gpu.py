@@ -22,7 +22,7 @@ from turbopi.tune.shapes import Call, Norm, Operation, Precision, operations
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")]
 DEVICE = torch.device("cuda", 0)
-MODEL = preset("pi05_libero").model
+MODEL = preset("pi05_libero").planned_model
 FEW = 6  # candidates of each
 
 

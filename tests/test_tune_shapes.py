@@ -26,7 +26,7 @@ from turbopi.tune.shapes import Call, calls, distinct, operations
 
 STEPS, HORIZON = 2, 10
 Ran = Counter[tuple[str, int, int, int]]
-FULL = preset("pi05_libero").model
+FULL = preset("pi05_libero").planned_model
 
 
 def recording(ran: Ran) -> Ops:

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_serve_openpi_client import PYTHON as CLIENT
 
 pytestmark = pytest.mark.slow
 
@@ -22,15 +21,10 @@ def commands() -> list[str]:
 
 @pytest.mark.timeout(3600)  # some ten commands
 def test_the_tutorial_runs_from_its_first_line_to_its_last(tmp_path: Path) -> None:
-    if not CLIENT.is_file():
-        pytest.skip(f"openpi-client isn't installed at {CLIENT}")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
     script = "set -euo pipefail\nset -m\n" + "\n".join(commands())
-    # the client's environment that is there already, and a port that no other test uses
-    install = "python3 -m venv robot && robot/bin/pip install openpi-client typing_extensions\n"
-    assert install in script
-    script = script.replace(install, "").replace("robot/bin/python", str(CLIENT))
+    # a port that no other test uses
     script = script.replace("8000", port).replace("--record recordings", f"--record recordings --port {port}")
     script = script.replace("kill %1\nwait", "kill %1\nwait || true")
     environment = os.environ | {
@@ -44,7 +38,7 @@ def test_the_tutorial_runs_from_its_first_line_to_its_last(tmp_path: Path) -> No
     assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
     for left in ("actions.npz", "actions.png", "fp8.json", "bench-report/results.json"):
         assert (tmp_path / left).is_file(), f"the tutorial left no {left}"
-    assert "(10, 7)" in ended.stdout, "the robot's loop got a chunk"
+    assert re.search(r"{[^}]*'fresh': [1-9]", ended.stdout), "the robot's loop got a chunk"
     assert "PASS" in ended.stdout
     assert not re.search(r"^Traceback", ended.stdout + ended.stderr, flags=re.MULTILINE)
     tables = [line for line in ended.stdout.splitlines() if "│" in line or "┃" in line]

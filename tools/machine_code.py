@@ -41,7 +41,7 @@ def _denoising(
     pair: bool = False,
     keep: bool = False,
 ) -> bytes:
-    arrangement = Arrangement(preset("pi05_libero").model)
+    arrangement = Arrangement(preset("pi05_libero").planned_model)
     sizes = denoise.kernel_sizes(
         arrangement,
         cache_rows=rows,
@@ -73,7 +73,7 @@ def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, 
 
 
 def _layer_norm(has_y: bool, in_fp8: bool, folder: Path | None) -> bytes:
-    sizes = layer_norm.constants(preset("pi05_libero").model.vision.width, has_y, in_fp8)
+    sizes = layer_norm.constants(preset("pi05_libero").planned_model.vision.width, has_y, in_fp8)
     return nvrtc.compile_cubin(layer_norm.source(in_fp8), ARCH, sizes, folder=folder)
 
 

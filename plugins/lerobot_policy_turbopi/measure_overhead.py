@@ -49,7 +49,7 @@ def policy_of(arguments: argparse.Namespace) -> TurboPiPolicy:
         **options,
     )
     config.chunk_size, config.max_action_dim = described.model.action_horizon, described.model.action_dim
-    config.image_resolution = (described.model.vision.image_size,) * 2
+    config.image_resolution = (described.planned_model.vision.image_size,) * 2
     return TurboPiPolicy(config, turbopi=turbopi)
 
 

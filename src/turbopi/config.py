@@ -10,12 +10,14 @@ Every size has a limit, LIMITS: a number beyond it is damage or a slip, and beli
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import is_finite, is_integer, shown
 
-Kind = Literal["pi05", "pi0"]
+PiKind = Literal["pi05", "pi0"]
+Kind = Literal["pi05", "pi0", "smolvla"]
+FloatPrecision = Literal["bf16", "f32"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's order; prefix tokens follow it
@@ -37,13 +39,16 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 }
 
 
-ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
+ImageResize = Literal["openpi", "lerobot", "lerobot_0.4", "lerobot_smolvla"]  # how, see preprocess/images.py
 Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: models/pi0/conditioning.py
 Solver = Literal[
     "euler", "midpoint", "heun", "ab2", "exponential"
 ]  # of the flow from noise to actions: models/pi0/solvers.py
 GridName = Literal["uniform", "shifted_to_noise", "shifted_to_actions"]
 TimeGrid = GridName | Sequence[float]  # or times, strictly falling from 1 to 0
+TimeRounding = Literal[
+    "accumulated", "multiplied"
+]  # of uniform times: openpi adds up t in float32; LeRobot: 1 + k * dt
 
 
 @dataclass(frozen=True)
@@ -79,11 +84,39 @@ class GemmaConfig:
     head_dim: int = 256
 
 
+class Network(Protocol):
+    """What the edges of a policy ask of a network's sizes, whatever its family. Always a frozen dataclass.
+
+    image_size         pixels of an image's side
+    state_dim          numbers of state that it takes
+    max_prompt_tokens  longer prompts are cut
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def kind(self) -> Kind: ...
+    @property
+    def image_size(self) -> int: ...
+    @property
+    def state_dim(self) -> int: ...
+    @property
+    def action_dim(self) -> int: ...
+    @property
+    def action_horizon(self) -> int: ...
+    @property
+    def vocab_size(self) -> int: ...
+    @property
+    def max_prompt_tokens(self) -> int: ...
+    @property
+    def time_grid(self) -> TimeRounding: ...
+
+
 @dataclass(frozen=True)
 class ModelConfig:
-    """The whole network. `action_horizon` shapes no weight: any H runs."""
+    """The whole network of a Pi0 or Pi0.5. `action_horizon` shapes no weight: any H runs."""
 
-    kind: Kind = "pi05"
+    kind: PiKind = "pi05"
     vision: VisionConfig = VisionConfig()
     vlm: GemmaConfig = GemmaConfig(width=2048, mlp_dim=16384)
     expert: GemmaConfig = GemmaConfig(width=1024, mlp_dim=4096)
@@ -93,13 +126,22 @@ class ModelConfig:
     max_prompt_tokens: int = 200
     rms_norm_eps: float = 1e-6
     rope_base: float = 10_000.0
-    # openpi accumulates t in float32; LeRobot computes 1 + step * dt
-    time_grid: Literal["accumulated", "multiplied"] = "accumulated"
+    time_grid: TimeRounding = "accumulated"
+
+    @property
+    def image_size(self) -> int:
+        """Pixels of an image's side, as it enters the network."""
+        return self.vision.image_size
+
+    @property
+    def state_dim(self) -> int:
+        """Numbers of state that the network takes."""
+        return self.action_dim
 
     def __post_init__(self) -> None:
         """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
-        if self.kind not in get_args(Kind):
-            raise ConfigError(f"kind is {shown(self.kind)}; expected one of {', '.join(get_args(Kind))}")
+        if self.kind not in get_args(PiKind):
+            raise ConfigError(f"kind is {shown(self.kind)}; expected one of {', '.join(get_args(PiKind))}")
         if self.time_grid not in ("accumulated", "multiplied"):
             raise ConfigError(f"time_grid is {shown(self.time_grid)}; expected 'accumulated' or 'multiplied'")
         for name, part in (("", self), ("vision ", self.vision), ("vlm ", self.vlm), ("expert ", self.expert)):
@@ -161,7 +203,7 @@ class PolicyConfig:
     """A model and its robot: everything `UnifiedPolicy` needs besides weights, statistics and a tokenizer."""
 
     name: str  # for people and metadata
-    model: ModelConfig  # the network's sizes, the action horizon, the longest prompt
+    model: Network  # the network's sizes, the action horizon, the longest prompt
     robot: str  # "libero", "droid", "aloha", "lerobot", "plain", or a path to a robot's .json
     normalization: Normalization = Normalization()  # how statistics scale state and actions
     discrete_state_input: bool = True  # the state is written into the prompt (Pi0.5 only)
@@ -176,6 +218,20 @@ class PolicyConfig:
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
     real_time: RealTime = RealTime()
+
+    @property
+    def planned_model(self) -> ModelConfig:
+        """`model`, for what the engine plans: kernels, engines, quantization, the roofline.
+
+        Raises ConfigError for a family that runs as its reference alone.
+        """
+        if not isinstance(self.model, ModelConfig):
+            raise ConfigError(
+                f"{self.name} is a {self.model.kind} policy, and this is for Pi0 and Pi0.5 alone: there are no "
+                f"kernels, engines, calibrations or conversions of a {self.model.kind} yet. `turbopi infer`, `serve`, "
+                "`eval` and `inspect` take it, on backends 'pytorch' and 'cuda_graph'"
+            )
+        return self.model
 
     def with_model(self, **changes: Any) -> "PolicyConfig":
         """The same policy with some of its model's fields replaced."""

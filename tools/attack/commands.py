@@ -49,7 +49,7 @@ BASES: dict[str, tuple[str, ...]] = {
 }
 _RARE = ("eval", "compare", "demo", "bench")  # seconds each: a fifth as often
 # Values of these could reach other machines, or files outside the folder.
-_NEVER = ("--host", "--help", "-h", "--install-completion", "--show-completion", "--debug", "--version")
+_NEVER = ("--host", "--help", "--help-all", "-h", "--install-completion", "--show-completion", "--debug", "--version")
 _OUTPUTS = ("--out", "--save", "--record", "--report", "--plot", "--cache")
 
 # fmt: off

@@ -126,7 +126,7 @@ def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
 
     Products of more tokens than vjp.MOST_TOKENS are Triton's, which are compiled for every target.
     """
-    expert = preset("pi05_libero").model.expert
+    expert = preset("pi05_libero").planned_model.expert
     made: dict[str, Callable[[Path | None], bytes]] = {}
     heads = expert.num_heads * expert.head_dim
     for tokens in (10, 50):
@@ -147,7 +147,7 @@ def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
 
 def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path | None) -> bytes:
     sizes = denoise.kernel_sizes(
-        preset("pi05_libero").model,
+        preset("pi05_libero").planned_model,
         blocks=MULTIPROCESSORS[target.capability],
         cache_rows=machine_code.CACHE_ROWS,
         suffix=suffix,

@@ -19,7 +19,7 @@ from turbopi.models.pi0.layers import apply_rope, rms_normalize, rope_tables
 from turbopi.quantization.fp8 import E4M3_MAX
 from turbopi.support.errors import BackendError
 
-FULL = preset("pi05_libero").model
+FULL = preset("pi05_libero").planned_model
 BF16 = torch.bfloat16
 GPU = torch.device("cuda", 0)
 

@@ -52,7 +52,7 @@ def disassembled(cubin: bytes, folder: Path, *options: str) -> str:
 
 def compiled(variant: Variant, tokens: int, fp8: bool) -> tuple[str, bytes, Arrangement]:
     """The full-size kernel's source, its machine code with lines, who does what."""
-    arrangement = Arrangement(preset("pi05_libero").model)
+    arrangement = Arrangement(preset("pi05_libero").planned_model)
     sizes = variant.sizes(arrangement, cache_rows=CACHE_ROWS, suffix=tokens, shared_bytes=SHARED_BYTES, fp8=fp8)
     source: str = variant.module.source(tokens, fp8)
     return source, nvrtc.compile_cubin(source, "sm_90a", sizes, lines=True), arrangement

@@ -3,7 +3,7 @@
     PYTHONPATH=tools:src:plugins/lerobot_policy_turbopi/src \\
         .venv-lerobot/bin/python -m lerobot_cases.plugin FOLDER
 
-Each FOLDER/*/ is a case of tests/golden_lerobot: checkpoint/ with its weights, inputs.npz, case.json.
+Each FOLDER/*/ is a case of tests/golden_lerobot or golden_smolvla: checkpoint/ with its weights, inputs.npz, case.json.
 It gets plugin.npz, everything by LeRobot's processors, loaded as its commands load them:
 
     {run}/actions            the plugin's chunk from the stored noise, float32 [H, d], un-normalised
@@ -40,7 +40,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     found: dict[str, torch.Tensor] = {}
     for index, wanted in enumerate(case["runs"]):
         batch = pre(_request(inputs, wanted["observation"]))
-        found[f"{index}/actions"] = post(policy.predict_action_chunk(batch, noise=noise, **wanted["call"]))[0]
+        found[f"{index}/actions"] = post(policy.predict_action_chunk(batch, noise=noise, **wanted.get("call", {})))[0]
     policy.reset()
     steps = range(policy.config.n_action_steps)
     chosen = [post(policy.select_action(pre(_request(inputs, 0)), noise=noise)) for _ in steps]
@@ -48,7 +48,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     torch.manual_seed(3)
     found["seeded"] = post(policy.predict_action_chunk(pre(_request(inputs, 0))))[0]
     own = PreTrainedConfig.from_pretrained(checkpoint)
-    if not own.use_peft and case["vision_heads"] == VISION_HEADS:
+    if not own.use_peft and case.get("vision_heads") == VISION_HEADS:
         own.pretrained_path = checkpoint
         config = TurboPiConfig(checkpoint=str(checkpoint), backend="pytorch", device="cpu")
         for name, one in (("lerobot_seeded", own), ("lerobot_bf16", replace(own, dtype="bfloat16")), ("bf16", config)):
@@ -61,7 +61,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     policy, pre, post = _load(again)
     first = case["runs"][0]
     batch = pre(_request(inputs, first["observation"]))
-    found["loaded_again"] = post(policy.predict_action_chunk(batch, noise=noise, **first["call"]))[0]
+    found["loaded_again"] = post(policy.predict_action_chunk(batch, noise=noise, **first.get("call", {})))[0]
     return {name: value.float().numpy() for name, value in found.items()}
 
 
@@ -84,9 +84,11 @@ def _request(inputs: dict[str, np.ndarray], index: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    shrink()
+    cases = sorted(Path(sys.argv[1]).glob("*/case.json"))
+    if not all(json.loads(case.read_text()).get("kind") == "smolvla" for case in cases):  # which is small by its config
+        shrink()
     torch.use_deterministic_algorithms(True)
-    for case in sorted(Path(sys.argv[1]).glob("*/case.json")):
+    for case in cases:
         found: dict[str, Any] = run(case.parent)
         np.savez(case.parent / "plugin.npz", **found)
         print(case.parent.name, flush=True)

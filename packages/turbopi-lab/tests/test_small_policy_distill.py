@@ -26,7 +26,7 @@ def settings(**changes: Any) -> Settings:
 
 @pytest.fixture(scope="module")
 def teacher() -> Pi0Model:
-    return trained_model(open_checkpoint(CHASE_POLICY).config.model, CHASE_POLICY).requires_grad_(False)
+    return trained_model(open_checkpoint(CHASE_POLICY).config.planned_model, CHASE_POLICY).requires_grad_(False)
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ def inputs(batch: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def lively_model() -> Pi0Model:
     """Fresh weights, but none of those that start at zero."""
-    model = fresh_model(CONFIG.model, 0).requires_grad_(False)
+    model = fresh_model(CONFIG.planned_model, 0).requires_grad_(False)
     for name, parameter in model.named_parameters():
         if name.startswith("action_out_proj") or ".dense." in name:
             parameter.normal_(0, 0.1)
@@ -75,7 +75,7 @@ def test_the_training_forward_is_the_reference_and_so_is_each_repeated_draw() ->
     assert expected.std() > 0.1
     found, hidden = velocity(model, images, tokens, masks, x_t, torch.full((3,), 0.7))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
-    assert hidden.shape == (3, 512 + tokens.shape[1], CONFIG.model.vlm.width)
+    assert hidden.shape == (3, 512 + tokens.shape[1], CONFIG.planned_model.vlm.width)
     others = torch.randn_like(x_t)
     both = torch.stack((x_t, others), dim=1).flatten(0, 1)
     times = torch.tensor([0.7, 0.2]).repeat(3)
@@ -315,7 +315,7 @@ def test_a_late_chunk_of_the_learner_takes_over_where_what_it_was_told_to_hold_e
 
 def test_what_an_actor_is_told_to_hold_begins_its_chunk_and_changes_the_rest() -> None:
     torch.manual_seed(0)
-    actor = Actor(CONFIG.model, 2, *prompt_table(), torch.device("cpu"))
+    actor = Actor(CONFIG.planned_model, 2, *prompt_table(), torch.device("cpu"))
     actor.take(lively_model().state_dict())
     camera_images = np.random.default_rng(0).integers(0, 256, (2, 2, 224, 224, 3), np.uint8)
     held = np.random.default_rng(1).uniform(-1, 1, (4, 7))

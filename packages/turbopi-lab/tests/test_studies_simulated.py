@@ -262,7 +262,7 @@ def test_slots_that_are_masked_alone_make_the_unmasked_cache_another() -> None:
 
 def test_padding_is_what_the_policys_own_pipeline_adds() -> None:
     policy, world = open_policy("chase"), CHASE.start([(7, 0)])
-    camera_images = world.draw(policy.config.model.vision.image_size)[0]
+    camera_images = world.draw(policy.config.planned_model.vision.image_size)[0]
     keys = ("observation/image", "observation/wrist_image")
     product = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
     given = dict(zip(keys, camera_images, strict=True)) | {

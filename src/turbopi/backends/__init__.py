@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
-from turbopi.config import ModelConfig
+from turbopi.config import Network
 from turbopi.engine.graph import preparing
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS, format_of
@@ -27,6 +27,7 @@ __all__ = [
     "Sample",
     "availability",
     "choose",
+    "class_for",
     "class_of",
     "create",
     "known",
@@ -40,13 +41,18 @@ PRECISIONS: tuple[Precision, ...] = ("bf16", "f32", *TIERS)
 
 @dataclass(frozen=True)
 class BackendSpec:
-    """Where a backend lives. extension: of another distribution's"""
+    """Where a backend lives.
+
+    extension  of another distribution's
+    unplanned  "module:class" that runs under this name what the engine has no plan for
+    """
 
     name: str
     module: str
     cls: str
     summary: str
     extension: extensions.Extension | None = None
+    unplanned: str | None = None
 
 
 _SPECS = (
@@ -62,6 +68,7 @@ _SPECS = (
         "turbopi.backends.cuda_graph",
         "CudaGraphBackend",
         "the whole call in CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
+        unplanned="turbopi.backends.captured:CapturedBackend",
     ),
     BackendSpec(
         "fused",
@@ -167,8 +174,8 @@ def _unavailable(cls: type[Backend], device: torch.device) -> str | None:
         return f"its check of the device failed: {extensions.reason(error)}"
 
 
-def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
-    """The backend that "auto" stands for on a device in a precision, and why."""
+def choose(device: torch.device, precision: Precision = "bf16", model: Network | None = None) -> tuple[str, str]:
+    """The backend that "auto" stands for on a device in a precision, and why. model: None: one of Pi0 or Pi0.5."""
     if precision in TIERS:
         untried = _untried("fused", device) if device.type == "cuda" else None
         return "fused", f"auto: the fast one of those that run in {precision}" + (f"; it {untried}" if untried else "")
@@ -179,6 +186,8 @@ def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, st
         if precision not in precisions(name):
             continue
         reason = availability(name, device) or _unproven(name, device)
+        if reason is None and model is not None:
+            reason = class_for(name, model).refuses_model(model)
         if reason is None:
             skipped = f" ({'; '.join(reasons)})" if reasons else ""
             return name, f"auto: the fastest backend for this GPU and precision{skipped}"
@@ -224,7 +233,7 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
 
 def create(
     name: str,
-    config: ModelConfig,
+    config: Network,
     load: LoadState,
     *,
     device: torch.device,
@@ -236,8 +245,11 @@ def create(
     quantization   for FP8 and INT8 alone: the calibration of this very checkpoint
     """
     check(name, device, precision)
+    cls = class_for(name, config)
+    if (why := cls.refuses_model(config)) is not None:
+        raise BackendUnavailable(why)
     with preparing(device):
-        return class_of(name)(config, load, device=device, precision=precision, quantization=quantization)
+        return cls(config, load, device=device, precision=precision, quantization=quantization)
 
 
 def precisions(name: str) -> tuple[Precision, ...]:
@@ -254,6 +266,16 @@ def class_of(name: str) -> type[Backend]:
         return _checked(spec.extension)
     cls: type[Backend] = getattr(importlib.import_module(spec.module), spec.cls)
     return cls
+
+
+def class_for(name: str, config: Network) -> type[Backend]:
+    """`class_of`, or the one that runs under that name what the engine has no plan for."""
+    spec, cls = BACKENDS.get(name), class_of(name)
+    if cls.refuses_model(config) is None or spec is None or spec.unplanned is None:
+        return cls
+    module, _, other = spec.unplanned.partition(":")
+    found: type[Backend] = getattr(importlib.import_module(module), other)
+    return found
 
 
 def _checked(extension: extensions.Extension) -> type[Backend]:

@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from turbopi.checkpoint.base import Room
-from turbopi.config import ImageResize, ModelConfig
+from turbopi.config import FloatPrecision, ImageResize, Network
+from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0.reference import FloatPrecision, Trace
+from turbopi.models.pi0.reference import Trace
 from turbopi.models.pi0.sample import Sample
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import Precision
@@ -50,7 +51,7 @@ class BegunBatch(Protocol):
 
 
 class Backend(ABC):
-    """All backends compute what `turbopi.models.pi0.reference.Pi0Model` computes.
+    """All backends compute what the reference of the model's family computes (`models.family_of`).
 
     Observations and noise may be on the host or on the device; both are moved where they are needed.
 
@@ -59,8 +60,8 @@ class Backend(ABC):
     any_horizon     whether noise may have another action horizon than the config's
     forms           what its denoising loop takes beside openpi's. A call without a conditioning, or with one of the
                     form "plain", is the ordinary call to the last bit
-    runs_batches    whether it has `begin_batch`: it starts on images before prompts are known, and runs a batch sooner
-                    than its observations one by one
+    begins          whether it has `begin_batch`: it resizes images and starts on them before prompts are known
+    runs_batches    whether it runs a batch sooner than its observations one by one, by `begin_batch`
     submits         whether it has `submit`: several observations may be in flight
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
@@ -70,13 +71,16 @@ class Backend(ABC):
     precisions: ClassVar[tuple[Precision, ...]]
     any_horizon: ClassVar[bool] = True
     forms: ClassVar[tuple[Form, ...]] = ()
+    begins: ClassVar[bool] = False
     runs_batches: ClassVar[bool] = False
     submits: ClassVar[bool] = False
     strict = False
 
+    config: Any  # a Network; a backend that plans says `ModelConfig`
+
     def __init__(
         self,
-        config: ModelConfig,
+        config: Network,
         load: LoadState,
         *,
         device: torch.device,
@@ -113,6 +117,13 @@ class Backend(ABC):
     def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         """Why this precision can't run on a GPU that the backend runs on; None if it can."""
         return None
+
+    @classmethod
+    def refuses_model(cls, config: Network) -> str | None:
+        """Why it can't run a model of this family; None if it can. Here: it runs what the engine has a plan for."""
+        if (family := family_of(config)).planned:
+            return None
+        return f"backend {cls.name!r} has no plan for {family.label}; take backend 'pytorch' or 'cuda_graph'"
 
     @classmethod
     def refuses_form(cls, form: Form) -> str | None:

@@ -30,6 +30,7 @@ class CudaGraphBackend(BatchRunner, Backend):
 
     name: ClassVar[str] = "cuda_graph"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
+    begins: ClassVar[bool] = True
     runs_batches: ClassVar[bool] = True
 
     def __init__(self, config: ModelConfig, load: LoadState, **options: Any) -> None:

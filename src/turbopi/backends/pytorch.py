@@ -5,25 +5,37 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
+from turbopi.config import FloatPrecision, Network
+from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0.reference import FloatPrecision, Pi0Model, Trace
+from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.support.errors import BackendError
 
 
 class PyTorchBackend(Backend):
-    """Runs `Pi0Model`; a batch of one is compacted exactly, larger ones as far as their masks allow."""
+    """Runs the reference of the model's family; a batch of one is compacted exactly, larger ones as far as their masks
+    allow.
+
+    model_class  in place of the family's own: a variant of Pi0's, which then is all that it runs
+    """
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
-    model_class: ClassVar[type[Pi0Model]] = Pi0Model
+    model_class: ClassVar[type[Pi0Model] | None] = None
     _warm = False
+    model: Any  # of the family
 
     def load_weights(self, load: LoadState) -> None:
         precision: FloatPrecision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
-        self.model = self.model_class.from_state(self.config, load(self.device, precision))
+        model_class = self.model_class or family_of(self.config).reference
+        self.model = model_class.from_state(self.config, load(self.device, precision))
+
+    @classmethod
+    def refuses_model(cls, config: Network) -> str | None:
+        return None if cls.model_class is None else super().refuses_model(config)
 
     def warmup(self, *arguments: Any, **options: Any) -> None:
         """One call: it loads libraries and fills allocators; other shapes need nothing more."""
@@ -61,8 +73,8 @@ class PyTorchBackend(Backend):
         return {"attention": "explicit float32" if self.precision == "f32" else "scaled_dot_product_attention"}
 
 
-def reference_model(backend: Backend) -> Pi0Model:
+def reference_model(backend: Backend) -> Any:
     """The reference that a backend runs. Raises BackendError for one that runs something else."""
-    if not isinstance(backend, PyTorchBackend):
+    if not isinstance(backend, PyTorchBackend) or backend.begins:
         raise BackendError(f"backend {backend.name!r} doesn't run the reference; take 'pytorch'")
     return backend.model

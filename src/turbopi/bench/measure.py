@@ -18,7 +18,7 @@ from turbopi.config import CAMERAS, Normalization, Solver, TimeGrid
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.plan import TIERS
 from turbopi.robots import Plain, Robot
 from turbopi.support.errors import ConfigError
@@ -72,13 +72,7 @@ def bench_policy(
 
 def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None = None) -> Job:
     """The robot's example: its cameras, prompt tokens and first image's size. The checkpoint's horizon and steps."""
-    found = load_tokenizer(
-        TINY_TOKENIZER if tokenizer is None and checkpoint.format == "random" else tokenizer,
-        checkpoint_dir=checkpoint.path,
-        named=checkpoint.named_tokenizer,
-        candidates=checkpoint.tokenizer_candidates,
-        vocab_size=checkpoint.config.model.vocab_size,
-    )
+    found = tokenizer_of(checkpoint, tokenizer)
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, found, robot=robot)
     one, config = pipeline.see(pipeline.example(), resize=False), checkpoint.config
     pipeline.read(one)

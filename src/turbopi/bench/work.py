@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
-from turbopi.config import GemmaConfig, ModelConfig
+from turbopi.config import GemmaConfig, ModelConfig, Network
 from turbopi.models import family_of
 
 _Count = Annotated[int, Meta(ge=1)]
@@ -70,11 +70,16 @@ class Work(Struct, frozen=True):
         return Work(self.flops + other.flops, self.bytes + other.bytes)
 
 
-def stage_work(config: ModelConfig, job: Job, bytes_per_value: int) -> dict[str, Work]:
+def stage_work(config: Network, job: Job, bytes_per_value: int) -> dict[str, Work]:
     """Stage ("vision", "prefix", "denoise") -> its work: compacted, the last prefix layer cut to K and V.
 
     A batch's observations read the weights together, and each has its own operations and KV cache.
     """
+    if not isinstance(config, ModelConfig):
+        counts = family_of(config).counts
+        assert counts is not None
+        stages = counts(config, job.cameras, job.prompt_tokens, job.horizon, job.steps, job.batch)
+        return {stage: Work(flops, values * bytes_per_value) for stage, (flops, values) in stages.items()}
     image_tokens = job.cameras * config.vision.num_tokens
     prefix = image_tokens + job.prompt_tokens
     suffix = job.horizon + family_of(config).state_token

@@ -80,7 +80,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     policy = UnifiedPolicy(checkpoint, **arguments)
     source, examples = observed.read_examples(policy, settings.observations, settings.count)
     chosen, held = observed.split(examples)
-    config = policy.config.model
+    config = policy.config.planned_model
     shape = (config.action_horizon, config.action_dim)
     calibration = with_noises(chosen, shape, settings.noises, settings.seed)
     held_out = with_noises(held, shape, settings.noises, settings.seed + len(calibration))

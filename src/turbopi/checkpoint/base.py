@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import prod
 from pathlib import Path
@@ -18,8 +18,8 @@ from torch import Tensor
 from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
-from turbopi.config import PolicyConfig
-from turbopi.models.pi0.reference import FloatPrecision, parameter_dtype
+from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig
+from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError
 
 SMALL_BYTES = 64 * 2**20  # of weights that are hashed at once, in a tenth of a second
@@ -88,12 +88,19 @@ class Checkpoint:
         found = None if key is None else known_hashes.look_up(key)
         return None if found is None else found[:12]
 
+    @property
+    def _named_tokenizer(self) -> list[Path]:
+        """The one that LeRobot's processors name, if it is elsewhere on this machine."""
+        file = None if self.named_tokenizer is None else self.named_tokenizer / "tokenizer.json"
+        return [] if file is None or not file.is_file() else [file]
+
     def load(self, device: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
         """Read all weights into their final dtype and device, piece by piece.
 
         Raises CheckpointError if a value is NaN or infinite, and as `check_hash`; for an ONNX export GraphsOnly.
         """
         self.check_hash()
+        dtype_of = family_of(self.config.model).parameter_dtype
         room = OneDevice(torch.device(device)) if isinstance(device, (str, torch.device)) else device
         began = time.perf_counter()
         shapes = self.source.shapes
@@ -102,7 +109,7 @@ class Checkpoint:
         with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
             for piece in self.source.pieces(room.device):
                 if piece.name not in state:
-                    dtype = parameter_dtype(piece.name, precision)
+                    dtype = dtype_of(piece.name, precision, self.config.model)
                     state[piece.name] = room(piece.name, shapes[piece.name], dtype)
                 place = put(state[piece.name], piece)
                 sums.setdefault(place.device, []).append(place.sum())
@@ -189,7 +196,7 @@ class Checkpoint:
             },
             "asset_id": self.asset_id,
             "norm_stats": norm_stats_info(self.norm_stats),
-            "tokenizers": [str(file) for file in self.tokenizer_candidates],
+            "tokenizers": [str(file) for file in self.tokenizer_candidates or self._named_tokenizer],
         }
 
 
@@ -222,6 +229,8 @@ def describe_weights(source: WeightSource) -> dict[str, Any]:
 
 def model_sizes_info(config: PolicyConfig) -> dict[str, Any]:
     model = config.model
+    if not isinstance(model, ModelConfig):
+        return asdict(model) | {"vocab_size": model.vocab_size}
     gemma = ("width", "mlp_dim", "depth", "num_heads", "num_kv_heads", "head_dim")
     vision = ("width", "depth", "mlp_dim", "num_heads", "patch_size", "image_size")
     return {

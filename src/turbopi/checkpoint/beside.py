@@ -39,8 +39,8 @@ def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfi
             "max_token_len": policy.model.max_prompt_tokens,
             "discrete_state_input": policy.discrete_state_input,
             "pi05": family_of(policy.model).modulated,
-            "paligemma_variant": policy.model.vlm,
-            "action_expert_variant": policy.model.expert,
+            "paligemma_variant": policy.planned_model.vlm,
+            "action_expert_variant": policy.planned_model.expert,
         }
     others = [
         f"{key} = {shown(said[key])} (used: {_readable(fact)})"
@@ -83,7 +83,7 @@ def notes_on_settings(
         for key, value in theirs.items()
         if key != "name" and value != ours[key]
     ]
-    heads = {"vision_heads": policy.model.vision.num_heads}
+    heads = {"vision_heads": policy.planned_model.vision.num_heads}
     others += [
         f"{key} = {shown(value)}"
         for key, value in beside.values.items()

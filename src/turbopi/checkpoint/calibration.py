@@ -26,7 +26,7 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     if quantization is None:
         return None
     if checkpoint.path is None:  # then `calibration_of` has checked the shapes alone
-        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+        quantization.check(checkpoint.config.planned_model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
         logger.warning("%s: %s", quantization.format.label, warning)
     return quantization
@@ -53,10 +53,10 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
     if checkpoint.path is None:  # weights would have to be made to be hashed
-        quantization.check_shapes(checkpoint.config.model)
+        quantization.check_shapes(checkpoint.config.planned_model)
     else:
-        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
-    plan = quantization.plan(checkpoint.config.model, tier)
+        quantization.check(checkpoint.config.planned_model, checkpoint.fingerprint(trust_files=True))
+    plan = quantization.plan(checkpoint.config.planned_model, tier)
     if not plan.scales:
         reasons = "; ".join(f"{count} sites: {why}" for why, count in Counter(plan.kept.values()).items())
         raise ConfigError(

@@ -66,7 +66,7 @@ def convert(
     checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
     with new_folder(dst) as folder:
         write_beside(checkpoint, folder)
-        _write_json(folder / "config.json", _openpi_config(checkpoint.config.model, precision))
+        _write_json(folder / "config.json", _openpi_config(checkpoint.config.planned_model, precision))
         _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
     return dst
 
@@ -98,7 +98,7 @@ def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision
     """Header first, then every piece at its place."""
     stored, dtype = _DTYPES[precision]
     shapes = {to_openpi(name): shape for name, shape in checkpoint.source.shapes.items()}
-    model = checkpoint.config.model
+    model = checkpoint.config.planned_model
     shapes[UNUSED_HEAD] = (model.vocab_size, model.expert.width)
     about = {TIED_EMBEDDING: TIED_HEAD}  # openpi's files record the tie like this
     if checkpoint.random is not None:
@@ -186,7 +186,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
     Raises ConfigError if some value of a hand-made PolicyConfig has no place in it.
     """
     robot = Path(config.robot) if config.robot.endswith(".json") else None
-    preset = config.name if _is_preset(config) else f"{config.model.kind}_base"
+    preset = config.name if _is_preset(config) else f"{config.planned_model.kind}_base"
     values = {
         "preset": preset,
         "name": config.name,
@@ -203,7 +203,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         "prompt_as_is": config.prompt_as_is,
         "time_grid": config.model.time_grid,
         "num_denoising_steps": config.num_denoising_steps,
-        "vision_heads": config.model.vision.num_heads,
+        "vision_heads": config.planned_model.vision.num_heads,
     }
     if config.prompt_labels:
         values["prompt_labels"] = True
@@ -217,13 +217,13 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         if values[name] is None and getattr(PRESETS[preset], name) is None:
             del values[name]
     parsed = Settings(SETTINGS, values=parse_values(json.loads(json.dumps(values)), SETTINGS))
-    back = policy_config(parsed, config.model.kind, assets=[], where=Path(SETTINGS))
+    back = policy_config(parsed, config.planned_model.kind, assets=[], where=Path(SETTINGS))
     lost = [
         f"{owner}.{item.name}"
         for owner, ours, theirs in (
             ("config", config, back),
             ("config.model", config.model, back.model),
-            ("config.model.vision", config.model.vision, back.model.vision),
+            ("config.planned_model.vision", config.planned_model.vision, back.planned_model.vision),
         )
         for item in fields(ours)
         if item.name not in _ELSEWHERE and getattr(ours, item.name) != getattr(theirs, item.name)
@@ -245,7 +245,7 @@ _ELSEWHERE = {"model", "vision", "vlm", "expert", "robot", "asset_id", "vocab_si
 
 
 def _is_preset(config: PolicyConfig) -> bool:
-    return config.name in PRESETS and PRESETS[config.name].model.kind == config.model.kind
+    return config.name in PRESETS and PRESETS[config.name].planned_model.kind == config.planned_model.kind
 
 
 def _write_json(file: Path, content: dict[str, object]) -> None:

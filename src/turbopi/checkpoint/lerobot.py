@@ -8,6 +8,7 @@ the processors' steps may be in lerobot_pipeline.py.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,8 +16,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from turbopi.checkpoint import lerobot_keys as keys
 from turbopi.checkpoint import lerobot_versions as versions
+from turbopi.checkpoint.lerobot_keys import PI, Keys
 from turbopi.checkpoint.lerobot_pipeline import (
     ACTION,
     NORMALIZER,
@@ -29,7 +30,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
-from turbopi.models import FAMILIES
+from turbopi.models import FAMILIES, Family
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, file_inside, one_line, read_json, shown
 
@@ -58,8 +59,11 @@ class LeRobotFolder:
     settings  what a turbopi.json puts over it
     untied    whether the weights hold lm_head beside the embedding, see lerobot_versions.py
 
-    Raises CheckpointError for what is neither Pi0.5 nor Pi0, is incomplete, or asks for what Turbo-Pi doesn't compute.
+    Of Pi0.5 and Pi0; another type's is derived from it (`lerobot_smolvla.py`). Raises CheckpointError for what is of no
+    type that is read, is incomplete, or asks for what Turbo-Pi doesn't compute.
     """
+
+    keys: ClassVar[Keys] = PI
 
     def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
@@ -85,33 +89,38 @@ class LeRobotFolder:
                 f"{self.folder} is a LeRobot checkpoint, which describes itself, so {settings.source} doesn't fit: use "
                 'config="auto", and put single differences, such as {"robot": "libero"}, into a turbopi.json there'
             )
-        old = self.semantics == "0.4"
+        described = self._described()
+        config = with_values(described, settings)
+        if config.robot == described.robot:
+            self._check_actions(config.normalization)
+        return config
+
+    def _described(self) -> PolicyConfig:
+        old, family = self.semantics == "0.4", FAMILIES[self.kind]
         summed = old and versions.sums_up_time(self.config.values)
-        described = PolicyConfig(
+        network = ModelConfig(
+            kind=family.kind,  # type: ignore[arg-type]  # of this class
+            action_horizon=self._chunk_size,
+            max_prompt_tokens=self.pipelines.max_tokens,
+            time_grid="accumulated" if summed else "multiplied",
+        )
+        return PolicyConfig(
             name=f"lerobot_{self.kind}",
-            model=ModelConfig(
-                kind=self.kind,
-                action_horizon=self._chunk_size,
-                max_prompt_tokens=self.pipelines.max_tokens,
-                time_grid="accumulated" if summed else "multiplied",
-            ),
+            model=network,
             robot="lerobot",
             normalization=self.normalization,
             robot_options=self._robot_options(),
             discrete_state_input=self.pipelines.state_in_prompt,
             image_resize="lerobot_0.4" if old else "lerobot",
             prompt_state_dim=self.pipelines.prompt_width or None if old else None,
-            prompt_as_is=not FAMILIES[self.kind].state_in_prompt,
-            prompt_labels=FAMILIES[self.kind].state_in_prompt and not self.pipelines.state_in_prompt,
-            num_denoising_steps=self.config.integer(
-                "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
-            ),
+            prompt_as_is=not family.state_in_prompt,
+            prompt_labels=family.state_in_prompt and not self.pipelines.state_in_prompt,
+            num_denoising_steps=self._steps("num_inference_steps"),
             real_time=self._real_time(),
         )
-        config = with_values(described, settings)
-        if config.robot == described.robot:
-            self._check_actions(config.normalization)
-        return config
+
+    def _steps(self, key: str) -> int:
+        return self.config.integer(key, 1, LIMITS["num_denoising_steps"], default=10)
 
     def norm_stats(self, normalization: Normalization) -> NormStats:
         """The statistics that the processors load. CheckpointError if `normalization` needs others."""
@@ -121,7 +130,7 @@ class LeRobotFolder:
     def notes(self) -> list[str]:
         """Where the files say two things or what isn't done, and what is done then; keys that nobody here knows."""
         notes = []
-        if unknown := keys.unknown(self.config.values):
+        if unknown := self.keys.unknown(self.config.values):
             notes.append(f"{CONFIG} has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}")
         if self._rtc_config is not None:
             what = "enables rtc_config: `infer(previous=…)` takes its schedule, weight and horizon where it has none"
@@ -131,8 +140,7 @@ class LeRobotFolder:
         notes += self.pipelines.notes
         if self.settings.policy is not None:
             return notes
-        if self.settings.values.get("lerobot_semantics", "auto") == "auto" and self.written_by != "0.6":
-            notes.append(versions.note(self.semantics, self.written_by, self.pipelines.prompt_width))
+        notes += self._notes_on_version()
         if self.described_state_dim != self.state_dim:
             notes.append(
                 f"{CONFIG} says {self.described_state_dim} values of state, but the statistics have {self.state_dim}: "
@@ -156,6 +164,12 @@ class LeRobotFolder:
             )
         return notes
 
+    def _notes_on_version(self) -> list[str]:
+        chosen = self.settings.values.get("lerobot_semantics", "auto") != "auto"
+        if chosen or self.written_by == "0.6":
+            return []
+        return [versions.note(self.semantics, self.written_by, self.pipelines.prompt_width)]
+
     def _check_config(self) -> Kind:
         kind = self.config.values.get("type")
         if not isinstance(kind, str) or kind not in FAMILIES:
@@ -163,6 +177,17 @@ class LeRobotFolder:
                 f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's "
                 f"{' and '.join(map(repr, FAMILIES))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
             )
+        family = FAMILIES[kind]
+        self._check_family(family)
+        if (refused := self.keys.refused(self.config.values)) is not None:
+            key, meaning = refused
+            raise CheckpointError(
+                f"{self.file} has {key} = {shown(self.config.values[key])}, which Turbo-Pi doesn't compute; it does "
+                f"{meaning}. Run this checkpoint with LeRobot's own policy"
+            )
+        return family.kind
+
+    def _check_family(self, family: Family) -> None:
         if "resize_imgs_with_padding" in self.config.values:
             raise CheckpointError(
                 f"{self.file} is of a LeRobot before 0.4, whose Pi0 had other tensors and no processors; Turbo-Pi "
@@ -171,7 +196,6 @@ class LeRobotFolder:
         state, action = (
             self.config.integer(f"max_{name}_dim", 1, LIMITS["action_dim"], 32) for name in ("state", "action")
         )
-        family = FAMILIES[kind]
         if family.state_token and state != action:
             raise CheckpointError(
                 f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's {family.label} has "
@@ -180,13 +204,6 @@ class LeRobotFolder:
         for key, choices in _CHOICES.items():
             if self.config.values.get(key) is not None:
                 self.config.choice(key, choices)
-        if (refused := keys.refused(self.config.values)) is not None:
-            key, meaning = refused
-            raise CheckpointError(
-                f"{self.file} has {key} = {shown(self.config.values[key])}, which Turbo-Pi doesn't compute; it does "
-                f"{meaning}. Run this checkpoint with LeRobot's own policy"
-            )
-        return family.kind
 
     @property
     def _chunk_size(self) -> int:
@@ -366,6 +383,12 @@ class LeRobotFolder:
 def is_lerobot(folder: Path) -> bool:
     """LeRobot's config.json has a `type`; openpi's has none."""
     return (folder / CONFIG).is_file() and "type" in _read_config(folder)
+
+
+def policy_type(folder: Path) -> str:
+    """What LeRobot calls the kind of policy; "" if that is no text."""
+    found = _read_config(folder).get("type")
+    return found if isinstance(found, str) else ""
 
 
 def _bare(value: object) -> str:

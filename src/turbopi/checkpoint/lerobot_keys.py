@@ -1,55 +1,104 @@
-"""The keys of a LeRobot config.json of Pi0.5 or Pi0, and what each value does here.
+"""The keys of a LeRobot config.json, by type of policy, and what each value does here.
 
     read        LeRobotFolder reads and checks it
     harmless    changes no action here, whatever it is: about training, the hub, devices, or what a caller decides
     neutral     computes something else unless it has one of these values: others are refused by the key's name
 
 Any other key is noted with its value: another program may compute something from it.
-Source: `PreTrainedConfig`, `PI05Config`, `PI0Config`, `RTCConfig` of LeRobot 0.4.0 to 0.6.1 and of its main branch in
-August 2026 (7427f31), field by field.
+Source: `PreTrainedConfig`, `PI05Config`, `PI0Config`, `SmolVLAConfig`, `RTCConfig` of LeRobot 0.4.0 to 0.6.1 and of its
+main branch in August 2026 (7427f31), field by field.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from turbopi.checkpoint.lerobot_versions import FIRST_KEYS
 from turbopi.support.reading import shown
 
-# key: (the values that Turbo-Pi computes, what that is)
-NEUTRAL: Mapping[str, tuple[tuple[object, ...], str]] = {
-    "image_resolution": (([224, 224],), "224 x 224 images"),
-    "min_period": ((4e-3,), "the time embedding's shortest period 0.004"),
-    "max_period": ((4.0,), "the time embedding's longest period 4.0"),
-    # MEM: neither its images nor, without proprioception, its weights differ from an ordinary policy's
-    "use_visual_memory": ((False,), "policies that see the current images alone"),
-    "use_proprioceptive_memory": ((False,), "policies that read the current state alone"),
-}
-READ = {
-    *("type", "input_features", "output_features", "use_peft", "paligemma_variant", "action_expert_variant", "dtype"),
-    *("chunk_size", "max_state_dim", "max_action_dim", "num_inference_steps", "empty_cameras", "tokenizer_max_length"),
-    *("normalization_mapping", "use_relative_actions", "action_feature_names", "rtc_config", "rtc_training_max_delay"),
-}
-HARMLESS = (FIRST_KEYS - READ - NEUTRAL.keys()) | {
-    *("freeze_vision_encoder", "train_expert_only", "optimizer_fused", "pretrained_revision"),
-    "relative_exclude_joints",  # the preprocessor's own list decides
-    *("memory_frames", "memory_stride", "memory_temporal_attention_every"),  # of memory, which is refused
-}
 # of rtc_config
 RTC_READ = {"enabled", "mode", "prefix_attention_schedule", "max_guidance_weight", "execution_horizon"}
 RTC_HARMLESS = {"debug", "debug_maxlen"}
 
 
-def refused(config: Mapping[str, object]) -> tuple[str, str] | None:
-    """The first key whose value computes something else, and what Turbo-Pi computes."""
-    for key, (values, meaning) in NEUTRAL.items():
-        if key in config and config[key] not in values:
-            return key, meaning
-    return None
+@dataclass(frozen=True)
+class Keys:
+    """Of one type of policy. neutral: key -> (the values that Turbo-Pi computes, what that is)."""
+
+    read: frozenset[str]
+    harmless: frozenset[str]
+    neutral: Mapping[str, tuple[tuple[object, ...], str]]
+
+    def refused(self, config: Mapping[str, object]) -> tuple[str, str] | None:
+        """The first key whose value computes something else, and what Turbo-Pi computes."""
+        for key, (values, meaning) in self.neutral.items():
+            if key in config and config[key] not in values:
+                return key, meaning
+        return None
+
+    def unknown(self, config: Mapping[str, object]) -> list[str]:
+        """`key = value` of each key that isn't in the table."""
+        known = self.read | self.harmless | self.neutral.keys()
+        odd = {key: config[key] for key in sorted(config.keys() - known)}
+        rtc = config.get("rtc_config")
+        if isinstance(rtc, Mapping):
+            odd |= {f"rtc_config.{key}": rtc[key] for key in sorted(rtc.keys() - RTC_READ - RTC_HARMLESS)}
+        return [f"{key} = {shown(value)}" for key, value in odd.items()]
 
 
-def unknown(config: Mapping[str, object]) -> list[str]:
-    """`key = value` of each key that isn't in the table."""
-    odd = {key: config[key] for key in sorted(config.keys() - READ - HARMLESS - NEUTRAL.keys())}
-    rtc = config.get("rtc_config")
-    if isinstance(rtc, Mapping):
-        odd |= {f"rtc_config.{key}": rtc[key] for key in sorted(rtc.keys() - RTC_READ - RTC_HARMLESS)}
-    return [f"{key} = {shown(value)}" for key, value in odd.items()]
+_PERIODS: Mapping[str, tuple[tuple[object, ...], str]] = {
+    "min_period": ((4e-3,), "the time embedding's shortest period 0.004"),
+    "max_period": ((4.0,), "the time embedding's longest period 4.0"),
+}
+_OF_PI_NEUTRAL: Mapping[str, tuple[tuple[object, ...], str]] = {
+    "image_resolution": (([224, 224],), "224 x 224 images"),
+    **_PERIODS,
+    # MEM: neither its images nor, without proprioception, its weights differ from an ordinary policy's
+    "use_visual_memory": ((False,), "policies that see the current images alone"),
+    "use_proprioceptive_memory": ((False,), "policies that read the current state alone"),
+}
+_OF_ALL = {
+    *("type", "input_features", "output_features", "use_peft", "chunk_size", "max_state_dim", "max_action_dim"),
+    *("empty_cameras", "tokenizer_max_length", "normalization_mapping", "rtc_config"),
+}
+_OF_PI = _OF_ALL | {
+    *("paligemma_variant", "action_expert_variant", "dtype", "num_inference_steps", "use_relative_actions"),
+    *("action_feature_names", "rtc_training_max_delay"),
+}
+_TRAINING = {"freeze_vision_encoder", "train_expert_only", "optimizer_fused", "pretrained_revision"}
+PI = Keys(
+    frozenset(_OF_PI),
+    frozenset(
+        (FIRST_KEYS - _OF_PI - _OF_PI_NEUTRAL.keys())
+        | _TRAINING
+        | {
+            "relative_exclude_joints",  # the preprocessor's own list decides
+            *("memory_frames", "memory_stride", "memory_temporal_attention_every"),  # of memory, which is refused
+        }
+    ),
+    _OF_PI_NEUTRAL,
+)
+SMOLVLA = Keys(
+    frozenset(
+        _OF_ALL
+        | {
+            *("resize_imgs_with_padding", "num_steps", "vlm_model_name", "load_vlm_weights", "attention_mode"),
+            *("add_image_special_tokens", "prefix_length", "num_expert_layers", "num_vlm_layers"),
+            *("self_attn_every_n_layers", "expert_width_multiplier", "min_period", "max_period"),
+        }
+    ),
+    frozenset(
+        _TRAINING
+        | {
+            *("n_obs_steps", "device", "use_amp", "push_to_hub", "repo_id", "private", "tags", "license"),
+            *("pretrained_path", "n_action_steps", "train_state_proj", "compile_model", "compile_mode"),
+            *("optimizer_lr", "optimizer_betas", "optimizer_eps", "optimizer_weight_decay"),
+            *("optimizer_grad_clip_norm", "scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"),
+            "pad_language_to",  # masked tokens change nothing
+        }
+    ),
+    {
+        "adapt_to_pi_aloha": ((False,), "the state and the actions as the dataset has them"),
+        "use_delta_joint_actions_aloha": ((False,), "absolute actions (LeRobot itself refuses it)"),
+        "use_cache": ((True,), "keys and values of the prefix once a call (LeRobot itself can't do without)"),
+    },
+)

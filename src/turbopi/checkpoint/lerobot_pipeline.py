@@ -18,6 +18,8 @@ Preprocessor of Pi0, whose prompt has no state; what is about the prompt may sta
     pi0_new_line_processor                          puts a newline behind the prompt, unless there is one
     tokenizer_processor                             prompt to tokens, as it is
 
+Preprocessor of SmolVLA: as Pi0's, with smolvla_new_line_processor and any tokenizer, which the Hub's cache may hold.
+
 Postprocessor; both may be missing:
 
     unnormalizer_processor                          scales actions back
@@ -38,6 +40,7 @@ from pathlib import Path
 from turbopi.config import LIMITS, Kind
 from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError
+from turbopi.support.hub_cache import hub_folder
 from turbopi.support.reading import Fields, file_inside, read_json, shown
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -94,8 +97,8 @@ class Pipelines:
     steps           the steps that compute something, by name
     rename_map      observations' names -> the policy's
     max_tokens      of a prompt
-    tokenizer       the folder that the tokenizer's name points to, in the checkpoint or elsewhere on this machine.
-                    None: it is PaliGemma's, by its name
+    tokenizer       the folder that the tokenizer's name points to, in the checkpoint, the Hub's cache or elsewhere on
+                    this machine. None: it is PaliGemma's, by its name
     notes           what isn't sure about them
     state_in_prompt whether prompts have the state: always Pi0.5's of LeRobot to 0.6.1, never Pi0's
     prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
@@ -104,6 +107,7 @@ class Pipelines:
 
     def __init__(self, folder: Path, kind: Kind = "pi05") -> None:
         self.notes: list[str] = []
+        self._paligemma = FAMILIES[kind].paligemma
         self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind)}
         self.rename_map = self._rename_map()
         self._check_task_keys()
@@ -199,6 +203,8 @@ class Pipelines:
         inside = folder / name  # an absolute name stays as it is
         if ".." not in Path(name).parts and os.path.isdir(inside):  # a name is any text: Path.is_dir may raise
             return inside
+        if not self._paligemma:
+            return hub_folder(name) or inside  # where it would be: a message names it
         if "paligemma" not in name.lower():
             raise CheckpointError(
                 f"{step.file} tokenises with {name}; expected {PALIGEMMA}, or the name of a folder beside it that has "

@@ -5,6 +5,7 @@ Canonical names (see `models/pi0/reference.py`) are openpi's with shorter prefix
 """
 
 from collections.abc import Collection
+from typing import Protocol
 
 _PALIGEMMA = "paligemma_with_expert.paligemma."
 _VISION = _PALIGEMMA + "model.vision_tower.vision_model."
@@ -73,3 +74,24 @@ def from_openpi(name: str) -> str:
         if name.startswith(theirs):
             return ours + name[len(theirs) :]
     return name
+
+
+class Names(Protocol):
+    """How a layout names a family's parameters."""
+
+    def canonical(self, key: str) -> str | None:
+        """Turbo-Pi's name of a file's key without its common prefix; None for what no action is computed from."""
+
+    def native(self, name: str) -> str:
+        """The other way round."""
+
+
+class PiNames:
+    """Pi0's and Pi0.5's, openpi's and LeRobot's."""
+
+    def canonical(self, key: str) -> str | None:
+        key = current_name(key)
+        return None if key == UNUSED_HEAD else from_openpi(key)
+
+    def native(self, name: str) -> str:
+        return to_openpi(name)

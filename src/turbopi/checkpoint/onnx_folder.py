@@ -17,7 +17,7 @@ import torch
 
 from turbopi.checkpoint.source import Piece, Shape, random_note
 from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
-from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.models import parameter_shapes
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, file_inside, is_integer, one_line, read_json, shown
 

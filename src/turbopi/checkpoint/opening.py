@@ -1,13 +1,16 @@
 """Opening a checkpoint: find it, read its description, check its tensors, and settle its configuration."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
-from turbopi.checkpoint.lerobot import LeRobotFolder
+from turbopi.checkpoint.lerobot import LeRobotFolder, policy_type
+from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder, SmolVLANames
 from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
+from turbopi.checkpoint.names import Names
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
@@ -17,9 +20,10 @@ from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, r
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import PolicyConfig
-from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.config import LIMITS, Kind, ModelConfig, PolicyConfig
+from turbopi.models import parameter_shapes
 from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.reading import Fields, read_json
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
@@ -34,10 +38,9 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     location = locate(path)
     settings = read_settings(config, location.folder)
     source = open_weights(location, settings)
-    kind = detect_kind(source, location.weights)
     if location.format == "lerobot":
         return _open_lerobot(location, settings, source)
-    folder = location.folder
+    kind, folder = detect_kind(source, location.weights), location.folder
 
     def policy_of(settings: Settings) -> PolicyConfig:
         return policy_config(settings, kind, assets=asset_ids(folder / "assets"), where=folder)
@@ -78,7 +81,7 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
             **describe_weights(source),
             "path": str(location.folder),
             "random_weights": getattr(source, "random", None) is not None,
-            "kind": detect_kind(source, location.weights),
+            "kind": _kind(location, source),
             "assets": asset_ids(location.folder / "assets"),
             **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
             **dict(zip(("action_dim",), source.shapes.get("action_in_proj.weight", ())[1:2], strict=False)),
@@ -93,13 +96,14 @@ def _without_policy(config: ConfigSource, location: Location) -> Settings:
         values = read_settings(config, location.folder).values
     except ConfigError:
         values = {}
-    needed = {"base_model": location.adapter, "normalization": location.format == "lerobot"}
+    lerobot = location.format == "lerobot"
+    needed = {"base_model": location.adapter, "vlm": lerobot, "normalization": lerobot}
     return Settings("none", values={key: values[key] for key in needed if needed[key] and key in values})
 
 
 def _lerobot_statistics(location: Location, settings: Settings) -> dict[str, Any]:
     """As `Checkpoint.info` has them. LeRobot keeps them in the processors' files, not below assets/."""
-    folder = LeRobotFolder(location.folder, settings)
+    folder = _lerobot_folder(location)(location.folder, settings)
     return {"normalization": asdict(folder.normalization), "norm_stats": norm_stats_info(folder.stats)}
 
 
@@ -122,7 +126,7 @@ def _source(location: Location, settings: Settings) -> WeightSource:
     if location.format == "onnx":
         return GraphSource(open_export(location.folder))
     prefix = "model." if location.format == "lerobot" else ""
-    source = TorchSource(location.weights, format=location.format, prefix=prefix)
+    source = TorchSource(location.weights, format=location.format, prefix=prefix, names=_names(location))
     if (location.weights / ADAPTER).is_file():
         source.notes.append(f"{ADAPTER} isn't followed: there are whole weights, and no use_peft = true in config.json")
     return source
@@ -134,14 +138,40 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
     if base.adapter or base.format == "openpi_jax":
         what = "an adapter itself: merge it" if base.adapter else "openpi's JAX format: convert it (turbopi convert)"
         raise CheckpointError(f"the base model of {location.folder} is {base.folder}, which is {what} first")
-    weights = TorchSource(base.weights, format="lerobot", prefix="model.")
+    weights = TorchSource(base.weights, format="lerobot", prefix="model.", names=_names(location))
     weights.notes[:0] = base.notes
     return PeftSource(location.folder, weights, base.folder)
 
 
+_READERS: Mapping[str, type[LeRobotFolder]] = {"smolvla": SmolVLAFolder}  # by type of policy; others: LeRobotFolder
+
+
+def _lerobot_folder(location: Location) -> type[LeRobotFolder]:
+    return _READERS.get(policy_type(location.folder), LeRobotFolder)
+
+
+def _names(location: Location) -> Names | None:
+    """How the weights are named, where that isn't Pi0's way."""
+    if location.format != "lerobot" or _lerobot_folder(location) is not SmolVLAFolder:
+        return None
+    config = Fields(read_json(location.folder / "config.json"), location.folder / "config.json")
+    return SmolVLANames(config.integer("num_vlm_layers", 1, LIMITS["depth"], default=16))
+
+
+def _kind(location: Location, source: WeightSource) -> Kind:
+    """The family, by the weights; where their names aren't Pi0's, by LeRobot's config.json."""
+    if location.format == "lerobot" and (reader := _lerobot_folder(location)) is not LeRobotFolder:
+        return reader(location.folder, _without_policy("auto", location)).kind
+    return detect_kind(source, location.weights)
+
+
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
-    untied = getattr(source, "untied", False)
-    folder = LeRobotFolder(location.folder, settings, untied=untied)
+    untied, reader = getattr(source, "untied", False), _lerobot_folder(location)
+    if reader is LeRobotFolder:
+        detect_kind(source, location.weights)  # says what weights of no family look like
+    if "vlm" in settings.values and reader is not SmolVLAFolder:
+        raise ConfigError(f"{settings.source}: vlm only applies to SmolVLA")
+    folder = reader(location.folder, settings, untied=untied)
     policy = _with_sizes(folder.policy_config(), source, settings, location)
     if policy.model.kind != folder.kind:
         raise CheckpointError(
@@ -152,7 +182,7 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         location.folder,
         settings,
         policy,
-        lambda other: LeRobotFolder(location.folder, other, untied=untied).policy_config(),
+        lambda other: reader(location.folder, other, untied=untied).policy_config(),
     )
     return Checkpoint(
         path=location.folder,
@@ -168,6 +198,8 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
 
 def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, location: Location) -> PolicyConfig:
     """`policy` with the checkpoint's sizes, after every tensor is checked against them."""
-    model = model_sizes(source, policy.model, vision_heads=settings.vision_heads, where=location.weights)
+    model = policy.model
+    if isinstance(model, ModelConfig):
+        model = model_sizes(source, model, vision_heads=settings.vision_heads, where=location.weights)
     check_tensors(source, parameter_shapes(model), location.weights)
     return replace(policy, model=model)

@@ -24,7 +24,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from turbopi.checkpoint.names import TIED_HEAD, UNUSED_HEAD, current_name, from_openpi
+from turbopi.checkpoint.names import TIED_HEAD, current_name
 from turbopi.checkpoint.source import Piece, listing
 from turbopi.checkpoint.torch_files import ITEMSIZE, Stored, TorchSource, read_header, read_tensor
 from turbopi.checkpoint.torch_files import WEIGHTS as MODEL
@@ -153,9 +153,9 @@ class PeftSource:
 
     def _target(self, key: str, stored: Stored) -> str:
         """The canonical name of the parameter at `key`; "" for heads, which no action is computed from."""
-        if current_name(key) in (TIED_HEAD, UNUSED_HEAD):
+        name = None if current_name(key) == TIED_HEAD else self._base.names.canonical(key)
+        if name is None:
             return ""
-        name = from_openpi(key)
         if name not in self._base.shapes:
             raise CheckpointError(f"{self._where}: {stored.key} is for {key}, which the base model doesn't have")
         return name
@@ -239,8 +239,10 @@ def base_model(folder: Path, given: str | None) -> Path:
     named = config.values.get("base_model_name_or_path")
     if given is not None:
         return Path(given)
-    if isinstance(named, str) and named and Path(named).expanduser().is_dir():  # relative to here, as LeRobot does
-        return Path(named).expanduser()
+    if isinstance(named, str) and named:
+        for place in (Path(named).expanduser(), folder / named):  # relative to here, as LeRobot does, or to the adapter
+            if place.is_dir():
+                return place
     what = f"names its base model {shown(named)}, which is no folder here" if named else "names no base model"
     fetch = f" (hf download {named} --local-dir DIR)" if re.fullmatch(r"[\w.-]+/[\w.-]+", str(named or "")) else ""
     raise CheckpointError(

@@ -14,7 +14,7 @@ bfloat16 by 0.4 %.
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import prod, sqrt
 from pathlib import Path
 
@@ -26,8 +26,8 @@ from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
 from turbopi.checkpoint.source import Piece, Shape, random_note, row_ranges
-from turbopi.config import PolicyConfig, preset
-from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.config import ModelConfig, PolicyConfig, preset
+from turbopi.models import RANDOM, parameter_shapes
 from turbopi.support.errors import ConfigError
 
 _ROBOT_DIMS = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14)}  # state, actions; other robots: the model's width
@@ -42,7 +42,12 @@ class RandomSource:
     def __init__(self, config: PolicyConfig, seed: int) -> None:
         self.shapes: dict[str, Shape] = parameter_shapes(config.model)
         self.dtypes = dict.fromkeys(self.shapes, "F32")
-        self.vision_heads: int | None = config.model.vision.num_heads
+        self.vision_heads: int | None = None  # as in LeRobot's layout
+        self._norms = 0.0  # what their scales are around: Gemma's are stored less 1
+        if isinstance(config.model, ModelConfig):
+            self.vision_heads = config.model.vision.num_heads
+        else:
+            self._norms = 1.0
         self.random: str | None = f"seed {seed}"
         self.notes = [random_note(self.random)]
         self.recipe = ("turbopi random weights 1", seed, sorted(self.shapes.items()))
@@ -55,7 +60,7 @@ class RandomSource:
         """Float32 pieces on `device`."""
         for name in sorted(self.shapes, key=lambda name: -prod(self.shapes[name])):
             shape = self.shapes[name]
-            mean, std = _scale(name, shape)
+            mean, std = _scale(name, shape, self._norms)
             row = prod(shape[1:])
             for start, stop in row_ranges(shape, 4):
                 values = torch.empty(stop - start, row, dtype=torch.float32, device=device).flatten()
@@ -74,7 +79,7 @@ def random_checkpoint(
     """
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise ConfigError(f"seed is {seed!r}; expected a whole number in [0, 2**32)")
-    config = preset_name if isinstance(preset_name, PolicyConfig) else preset(preset_name)
+    config = preset_name if isinstance(preset_name, PolicyConfig) else RANDOM.get(preset_name) or preset(preset_name)
     made_of = f"random weights, preset {config.name}, seed {seed}"
     if config_source != "auto":
         settings = read_settings(config_source, Path())
@@ -100,8 +105,9 @@ def _configured(base: PolicyConfig, settings: Settings) -> PolicyConfig:
     else:
         where = Path(f"the preset {base.name} of the random weights")
         config = policy_config(settings, base.model.kind, assets=[], where=where)
-    free = {name: getattr(config.model, name) for name in ("action_horizon", "max_prompt_tokens", "time_grid")}
-    return replace(config, model=replace(base.model, **free))
+    own = {one.name for one in fields(base.model)}
+    free = {name: getattr(config.model, name) for name in own & {"action_horizon", "max_prompt_tokens", "time_grid"}}
+    return replace(config, model=base.with_model(**free).model)
 
 
 def _plausible(dim: int) -> FeatureStats:
@@ -112,14 +118,14 @@ def _plausible(dim: int) -> FeatureStats:
     )
 
 
-def _scale(name: str, shape: Shape) -> tuple[float, float]:
+def _scale(name: str, shape: Shape, norms: float) -> tuple[float, float]:
     """Mean and standard deviation of a parameter; see the top of the file."""
     if ".dense." in name:
         return (0.0, 0.5) if name.endswith("bias") else (0.0, 2.0 / sqrt(shape[1]))
     if name.endswith("bias"):
         return 0.0, 0.1
     if len(shape) == 1:
-        return (1.0 if name.startswith("vision.") else 0.0), 0.1
+        return (1.0 if name.startswith("vision.") else norms), 0.1
     if name == "vision.position_embedding.weight":
         return 0.0, 0.3
     gain = 1.0

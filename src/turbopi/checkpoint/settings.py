@@ -15,7 +15,8 @@ itself.
     max_prompt_tokens     1 to 8192
     asset_id              folder of norm_stats.json below assets/; null for the only one there
     default_prompt        text or null
-    image_resize          "openpi", "lerobot", or "lerobot_0.4", which pads images with -3 instead of -1
+    image_resize          "openpi", "lerobot", "lerobot_0.4", which pads images with -3 instead of -1, or
+                          "lerobot_smolvla", which pads left and top alone
     prompt_state_dim      zeros fill the state up to so many numbers in the prompt (LeRobot 0.4: 32); null: nothing does
     prompt_as_is          true if Pi0's prompts keep their blanks, underscores and newlines, as in LeRobot
     prompt_labels         true if Pi0.5's prompts without a state keep "Task: " and "Action: ", as in LeRobot
@@ -30,6 +31,7 @@ itself.
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
+    vlm                   of SmolVLA alone: folder of the vision-language model's config.json, relative to this file
     weights_sha256        what `turbopi inspect --hash` shows of these weights: others are refused at loading
 
 Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
@@ -46,7 +48,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
-from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
+from turbopi.config import LIMITS, PRESETS, ImageResize, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
 from turbopi.models import family_of
 from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.support.errors import ConfigError
@@ -54,7 +56,14 @@ from turbopi.support.reading import is_finite, is_integer, read_json, shown
 from turbopi.support.text import did_you_mean, names_known
 
 FILE_NAME = "turbopi.json"
-ABOUT_WEIGHTS = {"lora_alpha", "lora_rslora", "base_model", "weights_sha256", "lerobot_semantics"}  # keys of a .json
+ABOUT_WEIGHTS = {
+    "lora_alpha",
+    "lora_rslora",
+    "base_model",
+    "vlm",
+    "weights_sha256",
+    "lerobot_semantics",
+}  # keys of a .json
 ConfigSource = str | Path | PolicyConfig
 
 
@@ -154,9 +163,12 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
         config = replace(config, robot_options={})
     config = replace(config, **{key: values[key] for key in _OF_POLICY if key in values})
-    config = config.with_model(**{key: values[key] for key in _OF_MODEL if key in values})
+    of_model = {key: values[key] for key in _OF_MODEL if key in values}
+    for key in of_model.keys() - {one.name for one in fields(config.model)}:
+        raise ConfigError(f"{settings.source}: {key} can't be chosen for {family_of(config.model).label}")
+    config = config.with_model(**of_model)
     check_real_time(config, settings.source)
-    if config.discrete_state_input and (family := family_of(config.model)).state_token:
+    if config.discrete_state_input and (family := family_of(config.model)).reads_state:
         raise ConfigError(
             f"{settings.source}: discrete_state_input is true, but {family.label} reads its state as a number token"
         )
@@ -202,8 +214,8 @@ def _undetectable(fitting: list[str], kind: Kind, assets: list[str], where: Path
 
 def _read_file(file: Path) -> Settings:
     parsed = parse_values(read_json(file, ConfigError), str(file))
-    if "base_model" in parsed:
-        parsed["base_model"] = str((file.parent / Path(parsed["base_model"]).expanduser()).resolve())
+    for folder in parsed.keys() & {"base_model", "vlm"}:
+        parsed[folder] = str((file.parent / Path(parsed[folder]).expanduser()).resolve())
     robot = parsed.get("robot")
     if robot is not None and robot.endswith(".json"):
         path = file.parent / robot
@@ -345,7 +357,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "max_prompt_tokens": _count(LIMITS["max_prompt_tokens"]),
     "asset_id": ("a folder's name below assets/, or null", _name_or_null),
     "default_prompt": ("a text or null", _text_or_null),
-    "image_resize": ("'openpi', 'lerobot' or 'lerobot_0.4'", _choice("openpi", "lerobot", "lerobot_0.4")),
+    "image_resize": (f"one of {', '.join(get_args(ImageResize))}", _choice(*get_args(ImageResize))),
     "prompt_state_dim": _count_or_null(LIMITS["action_dim"]),
     "prompt_as_is": ("true or false", _flag),
     "prompt_labels": ("true or false", _flag),
@@ -363,5 +375,6 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),
     "base_model": ("a folder", _text),
+    "vlm": ("a folder", _text),
     "weights_sha256": ("64 digits, 0 to 9 and a to f, as `turbopi inspect --hash` shows them", _sha256),
 }

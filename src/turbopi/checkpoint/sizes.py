@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import isqrt
+from typing import get_args
 
 from turbopi.checkpoint.source import Shape, WeightSource, listing
-from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, VisionConfig
+from turbopi.config import LIMITS, GemmaConfig, ModelConfig, PiKind, VisionConfig
 from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import shown
@@ -33,25 +34,32 @@ _PROBES = (
 )
 
 
-def detect_kind(source: WeightSource, where: object) -> Kind:
-    """The family whose marks the weights have. CheckpointError if it is none, or several."""
+def detect_kind(source: WeightSource, where: object) -> PiKind:
+    """Pi0.5 or Pi0, by the marks of its weights. CheckpointError if it is neither, or both."""
     names = source.shapes
-    marked = {kind: [name for name in names if name.startswith(one.marks)] for kind, one in FAMILIES.items()}
-    fitting = [kind for kind, ours in marked.items() if ours]
+    families = {kind: FAMILIES[kind] for kind in get_args(PiKind)}
+    marked = {kind: [name for name in names if name.startswith(one.marks)] for kind, one in families.items()}
+    fitting: list[PiKind] = [kind for kind, ours in marked.items() if ours]
     has_actions = any(name.startswith(("action_in_proj.", "expert.")) for name in names)
     if not has_actions and any(name.startswith("vlm.") for name in names):
         raise CheckpointError(
             f"{where} has a language model but no action expert: this looks like Pi0-FAST, which decodes action tokens "
-            "one by one. Turbo-Pi runs the flow-matching Pi0 and Pi0.5; serve this checkpoint with openpi"
+            "one by one. Turbo-Pi runs flow-matching policies; serve this checkpoint with openpi"
         )
+    for other in (one for kind, one in FAMILIES.items() if kind not in families):
+        if any(name.startswith(other.marks) for name in names):
+            raise CheckpointError(
+                f"{where} holds weights of {other.label}, but no config.json beside them says so: copy LeRobot's "
+                "config.json and its processors' files there, too"
+            )
     if len(fitting) != 1:
         found = f"tensors of both ({', '.join(marked[kind][0] for kind in fitting)})"
         if not fitting:
-            found = f"neither {' nor '.join(f'{one.marks[0]} ({one.label})' for one in FAMILIES.values())}"
+            found = f"neither {' nor '.join(f'{one.marks[0]} ({one.label})' for one in families.values())}"
             first = {name.split(".")[0].split("/")[0]: source.native_name(name) for name in sorted(names, reverse=True)}
             found += f". Of its {len(names)} tensors the first of each module: {listing(sorted(first.values()))}"
         raise CheckpointError(
-            f"{where} is neither {' nor '.join(one.label for one in FAMILIES.values())}: it has {found}"
+            f"{where} is neither {' nor '.join(one.label for one in families.values())}: it has {found}"
         )
     return fitting[0]
 

@@ -19,11 +19,10 @@ from turbopi.checkpoint.names import (
     EMBEDDING,
     TIED_EMBEDDING,
     TIED_HEAD,
-    UNUSED_HEAD,
+    Names,
+    PiNames,
     common_prefix,
     current_name,
-    from_openpi,
-    to_openpi,
 )
 from turbopi.checkpoint.source import (
     RANDOM_KEY,
@@ -61,8 +60,9 @@ class TorchSource:
 
     vision_heads: int | None = None  # no tensor of this layout tells
 
-    def __init__(self, folder: Path, *, format: str, prefix: str = "") -> None:
-        self.format = format
+    def __init__(self, folder: Path, *, format: str, prefix: str = "", names: Names | None = None) -> None:
+        """names: None: Pi0's"""
+        self.format, self.names = format, names or PiNames()
         self.notes: list[str] = []
         stored_tensors = _read_headers(folder)
         self._prefix = common_prefix([stored.key for stored in stored_tensors]) or prefix
@@ -73,9 +73,10 @@ class TorchSource:
         self.untied = False  # whether lm_head and the embedding are both stored
         for stored in stored_tensors:
             key = current_name(stored.key.removeprefix(self._prefix))
-            if key == UNUSED_HEAD:
+            tied = key in (TIED_HEAD, TIED_EMBEDDING)
+            kind, name = (heads, key) if tied else (self._stored, self.names.canonical(key))
+            if name is None:
                 continue
-            kind, name = (heads, key) if key in (TIED_HEAD, TIED_EMBEDDING) else (self._stored, from_openpi(key))
             if name in kind:
                 raise CheckpointError(f"{folder}: {kind[name].key} and {stored.key} are the same parameter")
             kind[name] = stored
@@ -99,7 +100,7 @@ class TorchSource:
         self.notes += check_zeros(self, empty, folder)
 
     def native_name(self, name: str) -> str:
-        return self._stored[name].key if name in self._stored else self._prefix + to_openpi(name)
+        return self._stored[name].key if name in self._stored else self._prefix + self.names.native(name)
 
     def pieces(self, device: torch.device) -> Iterator[Piece]:
         by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))

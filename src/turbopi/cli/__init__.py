@@ -1,7 +1,7 @@
 """The command line.
 
-turbopi demo | infer | serve | view | bench | plan | calibrate | verify | eval |
-    compare | inspect | convert | export | build | tune | backends | doctor
+Run: demo, infer, serve, view. Checkpoint: inspect, convert, calibrate, verify. Measure: bench, eval, compare.
+Advanced: plan, export, build, tune, doctor. Old names, hidden for one version: backends (doctor).
 """
 
 from importlib import metadata

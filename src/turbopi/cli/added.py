@@ -7,7 +7,8 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from turbopi.cli.framework import Command, Described, app, describe, log_to_stderr, with_errors_reported, without_types
+from turbopi.cli.framework import Described, app, describe, log_to_stderr, with_errors_reported
+from turbopi.cli.help import Command
 from turbopi.support import extensions
 from turbopi.support.errors import ConfigError
 
@@ -17,20 +18,38 @@ ELSEWHERE = {  # commands of ours that are installed apart
 }
 
 
+GROUPS = {  # of --help, in its order; what is named in none is advanced
+    "Run": ("demo", "infer", "serve", "view", "replay"),
+    "Checkpoint": ("inspect", "convert", "calibrate", "verify"),
+    "Measure": ("bench", "eval", "compare"),
+    "Advanced": (),
+}
+
+
 class Commands(TyperGroup):
-    """Turbo-Pi's own commands, then the others'."""
+    """Turbo-Pi's own commands by what they are for, then the others'."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        return without_types(super().get_params(ctx))
+        """Flags without a type: `--version <bool>` looks as if a value had to follow."""
+        params = super().get_params(ctx)
+        for param in params:
+            if getattr(param, "is_flag", False) and param.metavar is None:
+                param.metavar = ""
+        return params
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *added()]
+        grouped = [name for names in GROUPS.values() for name in names]
+        own = super().list_commands(ctx)
+        return [*(name for name in grouped if name in own), *(name for name in own if name not in grouped), *added()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """As --help lists it; None if there is none. What runs is `resolve_command`'s."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or (other := added().get(cmd_name)) is None:
+        own: Any = super().get_command(ctx, cmd_name)
+        if own is not None:
+            own.rich_help_panel = next((title for title, names in GROUPS.items() if cmd_name in names), "Advanced")
             return own
+        if (other := added().get(cmd_name)) is None:
+            return None
         return Command(cmd_name, help=escape(other.summary), rich_help_panel=f"Of {escape(other.distribution)}")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

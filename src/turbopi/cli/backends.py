@@ -1,33 +1,44 @@
-"""`turbopi backends`."""
+"""The list of backends, a part of `turbopi doctor`, and that command's old name."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import BackendUnavailable, ConfigError
 
+DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
+PrecisionOption = Annotated[
+    str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
+]
 
-@command("backends", examples=("turbopi backends", "turbopi backends --device cpu --json"))
-def backends(
-    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
-    precision: Annotated[
-        str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
-    ] = "bf16",
-    as_json: JsonFlag = False,
-) -> None:
-    """List the backends: whether each can run here, in which precisions, and why not."""
+
+@command("backends", hidden=True, examples=("turbopi backends", "turbopi backends --device cpu --json"))
+def backends(device: DeviceOption = "auto", precision: PrecisionOption = "bf16", as_json: JsonFlag = False) -> None:
+    """List the backends. A part of `turbopi doctor`, whose name this was."""
+    output = Output(as_json)
+    found = list_backends(device, precision)
+    show_backends(found, output)
+    output.line("note: `turbopi doctor` has this list, too; `turbopi backends` goes with the next version", "yellow")
+    output.document(found)
+
+
+def list_backends(device: str, precision: str) -> dict[str, Any]:
+    """Whether each backend can run here, in which precisions, and why not, as JSON values. Raises ConfigError."""
     from turbopi import backends as registry
 
-    output = Output(as_json)
     resolved = registry.resolve_device(device)
     if precision not in registry.PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
     chosen, why = registry.choose(resolved, precision)
     why = as_typed(why)
+    try:
+        registry.check(chosen, resolved, precision)
+        runs = True
+    except BackendUnavailable as error:
+        why, runs = f"auto can't run in {precision} here: {error}", False
     listed = [
         {
             "name": spec.name,
@@ -39,21 +50,28 @@ def backends(
         }
         for spec in registry.listed().values()
     ]
-    table = Table(title=f"backends on {resolved}", title_justify="left")
-    for column in ("backend", "available", "precisions", "what it is, or why it can't run and what to do"):
-        table.add_column(column)
-    for entry in listed:
-        mark = "[green]yes[/]" if entry["available"] else "[red]no[/]"
-        name = f"[bold]{entry['name']}[/] (auto)" if entry["auto"] else str(entry["name"])
+    return {
+        "device": str(resolved),
+        "precision": precision,
+        "auto": chosen,
+        "auto_reason": why,
+        "auto_runs": runs,
+        "backends": listed,
+    }
+
+
+def show_backends(found: dict[str, Any], output: Output) -> None:
+    """Print what `list_backends` found, in lines, so that a command can be copied whole."""
+    output.line(f"backends on {found['device']}", "bold")
+    width = max(len(entry["name"]) for entry in found["backends"])
+    for entry in found["backends"]:
+        mark = "[green]yes[/]" if entry["available"] else "[red]no[/] "
+        precisions = ", ".join(entry["precisions"]) + ("  (auto)" if entry["auto"] else "")
+        output.styled(f"{mark}   [bold]{entry['name']:<{width}}[/]  {precisions}")
         about = str(entry["summary"] if entry["available"] else entry["reason"])
-        table.add_row(name, mark, ", ".join(registry.precisions(str(entry["name"]))), escape(about))
-    output.table(table)
-    try:
-        registry.check(chosen, resolved, precision)
-        output.line(f"auto takes {chosen} in {precision}: {why.removeprefix('auto: ')}")
-    except BackendUnavailable as error:
-        why = f"auto can't run in {precision} here: {error}"
+        output.styled(f"      [dim]{escape(about)}[/]")
+    why = found["auto_reason"]
+    if found["auto_runs"]:
+        output.line(f"auto takes {found['auto']} in {found['precision']}: {why.removeprefix('auto: ')}")
+    else:
         output.line(why, "yellow")
-    output.document(
-        {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}
-    )

@@ -105,7 +105,7 @@ def _model(options: RobotOptions, checkpoint: str | None) -> ModelConfig:
     """The sizes of the weights that were named; of Pi0.5 if none were. No weight is loaded."""
     if checkpoint is None and options.random_weights is None:
         return ModelConfig()
-    return options.open(checkpoint).config.model
+    return options.open(checkpoint).config.planned_model
 
 
 def _joins(text: str) -> "list[Join]":
@@ -152,7 +152,7 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
 def bench(
     options: RobotOptions,
     checkpoint: CheckpointArgument = None,
-    backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi backends`.")] = "auto",
+    backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi doctor`.")] = "auto",
     beside: Annotated[
         str, typer.Option(metavar="NAME,NAME,…", help="Backends that are measured on the main job alone.")
     ] = "",

@@ -91,7 +91,7 @@ def build(
     from turbopi.policy.policy import UnifiedPolicy
 
     policy = UnifiedPolicy(opened, backend="pytorch", precision="bf16", device=resolved, progress=output.shows_progress)
-    config = policy.config.model
+    config = policy.config.planned_model
     state = dict(reference_model(policy.backend).state_dict())
     weights_hash, folder = fingerprint(state), (cache or default_folder()).expanduser()
     found = measure_scales(policy, calibration, method, output) if precision == "fp8" else None
@@ -152,7 +152,7 @@ def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, outp
         from turbopi.quantization.calibration_file import Quantization
 
         quantization = Quantization.load(path)
-        quantization.check(policy.config.model, policy._checkpoint.fingerprint())
+        quantization.check(policy.config.planned_model, policy._checkpoint.fingerprint())
         return from_quantization(model, quantization)
     observations, source = calibration_observations(policy, path)
     found = calibrate(model, observations, method=method, source=source)

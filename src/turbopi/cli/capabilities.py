@@ -31,9 +31,11 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
-    name = backends.choose(device, precision)[0] if fitting.backend == "auto" else fitting.backend  # type: ignore[arg-type]
+    model, name = checkpoint.config.model, fitting.backend
+    if name == "auto":
+        name = backends.choose(device, precision, model)[0]  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
-    cls = backends.class_of(name)
+    cls = backends.class_for(name, model)
     requested = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
     no_pipeline: Any = None  # no observation is read
     modes = ChunkConditioning(checkpoint.config, no_pipeline, cls, requested.integration).modes

@@ -14,7 +14,6 @@ from rich.table import Table
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
-from turbopi.models import FAMILIES
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
 from turbopi.support.text import data_size, denoising
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 PART_NAMES = {
     "vision": "vision tower (SigLIP)",
     "projector": "projector",
-    "vlm": "language model (PaliGemma)",
+    "vlm": "language model",
     "expert": "action expert",
     "action_time": "action, state and time projections",
 }
@@ -208,7 +207,9 @@ def _statistics_source(info: dict[str, Any]) -> str:
 
 
 def _state_input(info: dict[str, Any]) -> str:
-    if FAMILIES[info["kind"]].state_token:
+    from turbopi.models import FAMILIES  # which imports torch
+
+    if FAMILIES[info["kind"]].reads_state:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
 

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.evaluate import EvalOptions, run_with_progress
+from turbopi.cli.evaluate_options import COMMON_EVAL
 from turbopi.cli.files import check_report
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.support.errors import ConfigError
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 @command(
     "compare",
     shared=EvalOptions,
+    common=("--checkpoint", "--simulator", *COMMON_EVAL),
     examples=(
         "turbopi compare turbopi-eval/run-a turbopi-eval/run-b",
         "turbopi compare pytorch:f32 pytorch:bf16:5 --checkpoint mine --trials 10",

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from turbopi.policy.shipped import Frame
     from turbopi.verify.demo import OracleCheck
 
+NEXT = (
+    "next, with your own: turbopi inspect CHECKPOINT, then turbopi infer CHECKPOINT OBSERVATION. From there to a robot "
+    "that moves: docs/tutorial.md"
+)
+
 
 @command(
     "demo",
@@ -83,7 +88,9 @@ def demo(
             raise ConfigError("--frames is for images of LIBERO, which --real-time doesn't show: leave it out")
         from turbopi.cli.demo_real_time import show_real_time
 
-        show_real_time(options, checkpoint, episodes, seed, report, Output(as_json))
+        output = Output(as_json)
+        show_real_time(options, checkpoint, episodes, seed, report, output)
+        output.line(NEXT)
         return
     if episodes is not None and episodes > 20:
         raise ConfigError(f"--episodes is {episodes}; LIBERO's part of the demo plays 20 at most (turbopi eval libero)")
@@ -101,6 +108,7 @@ def demo(
     run = _Run(options, checkpoint, frames, seed, output)
     run.play(report / "episodes", episodes)
     run.report_to(report)
+    output.line(NEXT)
     if not run.check.ok:
         raise typer.Exit(CHECK_FAILED)
 

@@ -44,7 +44,7 @@ def show_real_time(
     policy = options.make_policy(opened, output)
     policy.warmup()
     source, count = LocalPolicy(policy), EPISODES if episodes is None else episodes
-    px = policy.config.model.vision.image_size
+    px = policy.config.model.image_size
     cells = [(WAYS[0], 0), *((way, DELAY) for way in WAYS)]
     played = []
     with Progress(console=new_console(stderr=True), disable=not output.shows_progress) as bar:
@@ -58,14 +58,17 @@ def show_real_time(
         output.line(
             f"  {one.way}, delay {one.delay}: {one.rate.successes} of {one.rate.trials} {one.rate}{jump}", "bold"
         )
+    order = sorted(played, key=lambda one: -one.rate.successes)
+    named = ", ".join(f"{one.way} with delay {one.delay} ({one.rate.successes})" for one in order)
+    output.line(f"By successes: {named}.")
     change, gain = paired(ideal, naive), paired(naive, joined)
     output.line(
-        f"A delay of {DELAY} control steps changes naive asynchronous execution by {_points(change)}: each chunk was "
-        "computed as if its own first actions had been carried out meanwhile."
+        f"A delay of {DELAY} control steps changes naive asynchronous execution by {_points(change)}. "
+        + _why(change, -1, "Each chunk was computed as if its own first actions had been carried out meanwhile", count)
     )
     output.line(
-        f"Joining chunks ({WAYS[1]}) changes that by {_points(gain)}: the model is told which actions are carried out "
-        "meanwhile, and continues them."
+        f"Joining chunks ({WAYS[1]}) changes that by {_points(gain)}. "
+        + _why(gain, 1, "The model is told which actions are carried out meanwhile, and continues them", count)
     )
     report.mkdir(parents=True, exist_ok=True)
     plots = [plot_successes(report / "real_time.png", played), plot_commands(report / "commands.png", played)]
@@ -89,6 +92,16 @@ def show_real_time(
     write_whole(report / "real_time.json", json.dumps(reported, indent=1) + "\n")
     output.line(f"plots: {', '.join(map(str, plots))}")
     output.document({name: value for name, value in reported.items() if name != "policy"} | {"report": str(report)})
+
+
+def _why(paired: "Paired", sign: int, reason: str, count: int) -> str:
+    """The reason, if the difference has this sign beyond chance."""
+    low, high = sorted(sign * end for end in paired.interval)
+    if low > 0:
+        return f"{reason}."
+    if high < 0:
+        return "Here the other way was expected."
+    return f"{count} episodes don't tell whether there is a difference: --episodes 100 or more."
 
 
 def _points(paired: "Paired") -> str:

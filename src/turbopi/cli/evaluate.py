@@ -13,7 +13,7 @@ from rich.table import Table
 
 from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.capabilities import capabilities_of
-from turbopi.cli.evaluate_options import EvalOptions
+from turbopi.cli.evaluate_options import COMMON_EVAL, EvalOptions
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
@@ -36,6 +36,7 @@ DEFAULT_OUT = Path("turbopi-eval")
 @command(
     "eval",
     shared=EvalOptions,
+    common=("--host", "--port", *COMMON_EVAL),
     examples=(
         "turbopi eval libero checkpoints/pi05_libero --config pi05_libero",
         "turbopi eval libero checkpoints/pi05_libero --suite goal --trials 10",

@@ -8,7 +8,7 @@ import typer
 
 from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
-from turbopi.cli.options import PolicyOptions
+from turbopi.cli.options import COMMON, PolicyOptions
 from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 _EPISODES, _PROTOCOL, _RUNS, _OUTPUT = "Which episodes", "Protocol (openpi's unless given)", "How fast", "Output"
 _DELAY = "Under delay"
+COMMON_EVAL = (  # what --help shows without --help-all
+    *("--suite", "--tasks", "--trials", "--initial-states", "--replan", "--execution", "--delay-steps", "--workers"),
+    *("--videos", "--out", "--restart", *COMMON),
+)
 
 
 def _option(*names: str, panel: str, help: str, metavar: str | None = None, **more: Any) -> Any:

@@ -95,7 +95,7 @@ def export(
         maker = resolve_device("auto")
     loaded = checkpoint.load(maker, "f32", progress=output.shows_progress).state
     state = {name: loaded.pop(name).cpu() for name in list(loaded)}
-    model = Pi0Model.from_state(checkpoint.config.model, state)
+    model = Pi0Model.from_state(checkpoint.config.planned_model, state)
     written = export_onnx(model, target, checkpoint=checkpoint, calibration=found, report=output.line)
     if checkpoint.format == "random":
         complete_random(written.folder, options.weights_seed or 0)

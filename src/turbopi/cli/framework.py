@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import rich
 import typer
@@ -27,8 +27,8 @@ from msgspec import Struct
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from typer.core import TyperCommand
 
+from turbopi.cli.help import Command, show_all
 from turbopi.cli.process import (
     BAD_INPUT,
     DEVICE_LOST,
@@ -62,6 +62,10 @@ JsonFlag = Annotated[
 _Debug = Annotated[
     bool, typer.Option("--debug", envvar="TURBOPI_DEBUG", help="Show the traceback of an error.", show_default=False)
 ]
+_HelpAll = Annotated[
+    bool,
+    typer.Option("--help-all", is_eager=True, callback=show_all, help="Show every option.", show_default=False),
+]
 
 
 class Output:
@@ -72,8 +76,8 @@ class Output:
         self.console = new_console(stderr=as_json)
 
     def line(self, text: str = "", style: str | None = None) -> None:
-        """A line, taken as it is and never wrapped."""
-        self.console.print(escape(text), style=style, highlight=False, soft_wrap=True)
+        """A line, taken as it is; on a terminal it wraps between words, in a file or a pipe never."""
+        self.console.print(escape(text), style=style, highlight=False, soft_wrap=not self.console.is_terminal)
 
     def styled(self, markup: str) -> None:
         """A line with rich's markup, never wrapped."""
@@ -118,21 +122,6 @@ def plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else value
 
 
-class Command(TyperCommand):
-    """A command whose --help gives flags no type: `--json <bool>` looks as if a value had to follow."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        return without_types(super().get_params(ctx))
-
-
-def without_types(params: list[Any]) -> list[Any]:
-    """The same options, and nothing in --help's column of types for flags."""
-    for param in params:
-        if getattr(param, "is_flag", False) and param.metavar is None:
-            param.metavar = ""
-    return params
-
-
 class CheckpointThen(Command):
     """A command whose one argument is a list: a checkpoint, which random weights do without, and something else."""
 
@@ -151,18 +140,24 @@ class Described:
     help: str
     epilog: str | None
 
-    def declare(self, to: typer.Typer, name: str) -> None:
-        to.command(name, cls=self.cls, help=self.help, epilog=self.epilog)(self.run)
+    def declare(self, to: typer.Typer, name: str, *, hidden: bool = False) -> None:
+        to.command(name, cls=self.cls, help=self.help, epilog=self.epilog, hidden=hidden)(self.run)
 
 
 def command(
-    name: str, *, examples: Sequence[str], shared: type | None = None, cls: type[Command] = Command
+    name: str,
+    *,
+    examples: Sequence[str],
+    shared: type | None = None,
+    cls: type[Command] = Command,
+    common: Sequence[str] = (),
+    hidden: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Declare a function as `turbopi <name>`, as `describe` has it."""
+    """Declare a function as `turbopi <name>`, as `describe` has it. `hidden`: --help doesn't list it."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        described = describe(function, examples=examples, shared=shared, cls=cls)
-        described.declare(app, name)
+        described = describe(function, examples=examples, shared=shared, cls=cls, common=common)
+        described.declare(app, name, hidden=hidden)
         return described.run
 
     return decorate
@@ -174,6 +169,7 @@ def describe(
     examples: Sequence[str] = (),
     shared: type | None = None,
     cls: type[Command] = Command,
+    common: Sequence[str] = (),
     owner: str = "Turbo-Pi's own",
 ) -> Described:
     """A function with typer's annotations as a command.
@@ -181,12 +177,13 @@ def describe(
     examples   command lines for the end of its --help
     shared     a dataclass whose annotated fields become options; the function gets an instance as `options`
     cls        for another usage line
+    common     the options that --help shows; the others come with --help-all, by topic. (): --help shows all
     owner      whose code it is, for the message of a fault
     """
     shared_fields = fields(shared) if shared is not None else ()
 
     @functools.wraps(function)
-    def run(*, debug: bool, **values: object) -> None:
+    def run(*, debug: bool, help_all: bool = False, **values: object) -> None:
         given = dict(values)
         if shared is not None:
             values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
@@ -207,6 +204,9 @@ def describe(
         *injected,
         inspect.Parameter("debug", keyword, default=False, annotation=_Debug),
     ]
+    if common:
+        parameters.append(inspect.Parameter("help_all", keyword, default=False, annotation=_HelpAll))
+        cls = type(cls.__name__, (cls,), {"common": tuple(common)})
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     del run.__wrapped__  # or typer would read the undecorated signature
@@ -251,7 +251,8 @@ def with_errors_reported(work: Callable[[], None], *, debug: bool, owner: str = 
         if message is None:
             message = f"this is a fault of {owner} ({type(error).__name__}); please report it with the traceback"
         console = new_console(stderr=True)
-        console.print(f"[bold red]error:[/] {escape(_shortened(message))}", highlight=False, soft_wrap=True)
+        said = f"[bold red]error:[/] {escape(_shortened(message))}"
+        console.print(said, highlight=False, soft_wrap=not console.is_terminal)
         raise typer.Exit(_exit_code(error)) from None
 
 
@@ -294,7 +295,11 @@ class _StderrHandler(logging.Handler):
         time = f"{_iso(record.created)} " if self.stamped else ""
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         with contextlib.suppress(OSError, ValueError):  # whoever read the log has left: no reason to stop working
-            print(f"{time}{level}{as_typed(record.getMessage())}", file=sys.stderr, flush=True)
+            text = f"{time}{level}{as_typed(record.getMessage())}"
+            if sys.stderr.isatty() and not self.stamped:
+                new_console(stderr=True).print(escape(text), highlight=False)
+            else:
+                print(text, file=sys.stderr, flush=True)
             if record.exc_info:
                 traceback.print_exception(*record.exc_info, file=sys.stderr)
 

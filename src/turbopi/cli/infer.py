@@ -2,6 +2,7 @@
 
 import contextlib
 import secrets
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from turbopi.support.files import write_whole
 if TYPE_CHECKING:
     import numpy as np
 
-    from turbopi.config import ModelConfig
+    from turbopi.config import Network
     from turbopi.policy.policy import UnifiedPolicy
     from turbopi.policy.ranges import DrawnRange
     from turbopi.policy.watch import Reading
@@ -99,6 +100,9 @@ def infer(
     from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
+    for file in (out, drawing):
+        if file is not None and file.exists():
+            output.line(f"note: {file} is there, and is replaced; --out names another file", "yellow")
     from turbopi.robots import read_state
 
     sources = _sources(Path(source), call)
@@ -161,8 +165,23 @@ def _check_targets(source: Path, out: Path, drawing: Path | None) -> None:
             raise ConfigError(f"{file} is the observation itself, or part of it: write to another file")
     if drawing is not None and drawing.absolute() == out.absolute():
         raise ConfigError(f"the actions and the plot would both be written to {out}: end the former's name in .npz")
+    if out.is_file() and source.exists() and not _is_ours(out):
+        raise ConfigError(
+            f"{out} is there and isn't what `turbopi infer` wrote, so it isn't replaced; name another file"
+        )
     if drawing is not None and drawing.suffix not in PLOT_SUFFIXES:
         raise ConfigError(f"the plot {drawing} should end in one of {', '.join(PLOT_SUFFIXES)}")
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether a file holds what this command writes, or nothing."""
+    if not file.stat().st_size:
+        return True
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return set(archive.namelist()) == {"actions.npy", "noise.npy"}
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _is_of(file: Path, source: Path) -> bool:
@@ -195,7 +214,7 @@ def _sources(path: Path, call: int | None) -> list[Path]:
 
 
 def _noise(
-    model: "ModelConfig", given: "np.ndarray | None", seed: int | None, output: Output
+    model: "Network", given: "np.ndarray | None", seed: int | None, output: Output
 ) -> Callable[[int], "np.ndarray"]:
     """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
     import numpy as np

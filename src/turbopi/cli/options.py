@@ -23,6 +23,10 @@ MOST_CALLS, MOST_OBSERVATIONS, MOST_NOISES = 1_000_000, 100_000, 1000  # more is
 SHOW_LOADING_BYTES = 1e9  # smaller weights load before a line about it is read
 
 _WEIGHTS, _RUNNING = "Weights", "How to run them"
+COMMON = (  # of these options, what --help shows without --help-all
+    *("--random-weights", "--config", "--robot"),
+    *("--backend", "--precision", "--quantization", "--steps"),
+)
 CHECKPOINT_HELP = "A checkpoint's folder: openpi's (PyTorch or JAX), LeRobot's, or an ONNX export."
 
 CheckpointArgument = Annotated[
@@ -79,7 +83,8 @@ class WeightOptions:
             "--random-weights",
             panel=_WEIGHTS,
             metavar="PRESET",
-            help=f"Random weights instead of a checkpoint: {', '.join(PRESETS)}. Their actions mean nothing.",
+            help=f"Random weights instead of a checkpoint: {', '.join(PRESETS)} or smolvla_base. Their actions mean "
+            "nothing.",
         ),
     ] = None
     weights_seed: Annotated[
@@ -184,7 +189,7 @@ class PolicyOptions(RobotOptions):
     """Which weights, and everything else that UnifiedPolicy is made of."""
 
     backend: Annotated[
-        str, _option("--backend", panel=_RUNNING, metavar="NAME", help="One of `turbopi backends`, or auto.")
+        str, _option("--backend", panel=_RUNNING, metavar="NAME", help="One that `turbopi doctor` lists, or auto.")
     ] = "auto"
     precision: Annotated[
         str | None,
@@ -276,7 +281,10 @@ class PolicyOptions(RobotOptions):
             from turbopi.policy.policy import UnifiedPolicy
 
             if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
-                output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
+                output.line(
+                    f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights ({checkpoint.format}) from "
+                    f"{checkpoint.path}: the disk decides how long this takes, minutes on a slow one …"
+                )
             fitting = self.for_checkpoint(checkpoint)
             policy = UnifiedPolicy(
                 checkpoint, progress=output.shows_progress, strict=strict, **fitting.policy_arguments()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.config import LIMITS
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from turbopi.serve.fleet.sizing import Fleet, Plan
 
 MOST_ROBOTS = 10_000
+RUN = "run"  # begins the line with the command
 DECODED = 500  # observations a second, by one server (docs/fleet.md)
 
 
@@ -92,9 +94,30 @@ def plan(
     planned = plan_fleet(fleet, table.seconds, max_batch, gpus)
     output = Output(as_json)
     for line in lines(fleet, table, planned):
-        output.line(line)
+        if line.startswith(RUN):
+            output.styled(escape(line))  # to be copied whole
+        else:
+            output.line(line)
     output.document(
         {"fleet": asdict(fleet), "times": plain_document(table), "predicted": table.predicted, "plan": asdict(planned)}
+    )
+
+
+def _untried(table: "BatchTable") -> str | None:
+    """Why `auto` wouldn't run this there; None if it would."""
+    from turbopi.backends import _RUN_ON
+    from turbopi.bench.gpus import find_gpu
+    from turbopi.quantization.plan import TIERS
+
+    if not table.predicted or table.precision in TIERS:  # a calibrated precision is the user's choice
+        return None
+
+    gpu = find_gpu(table.gpu)
+    if gpu.capability[0] in _RUN_ON.get(table.backend, gpu.capability[:1]):
+        return None
+    return (
+        f"{table.backend} was never run on a {gpu.name}, and `auto` doesn't take it there. Measure yours with "
+        f"`turbopi bench --backends {table.backend} --horizons {table.job.horizon} --batch 1,2,4,8`, then give --times"
     )
 
 
@@ -113,6 +136,7 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     if fleet.robots > ServerOptions.max_clients:
         serve += f" --max-clients {fleet.robots}"
     a_second = fleet.robots * fleet.hz / fleet.steps
+    untried = _untried(table)
     each_has = f"{planned.robots_per_gpu} robot{'s' * (planned.robots_per_gpu > 1)}"
     reported = [
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
@@ -125,7 +149,9 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         f"delay        {planned.delay_steps} control steps at most "
         f"({planned.worst_seconds * 1e3:.1f} ms and {fleet.overhead(planned.gpus):g} ms overhead)",
         f"utilisation  {planned.utilisation:.0%}",
-        f"run          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else ""),
+        f"{RUN}          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else "")
+        if untried is None
+        else f"no command is recommended: {untried}",
     ]
     if fleet.steps == fleet.horizon:
         reported.append("Robots carry out whole chunks, and stand still for the delay")

@@ -12,9 +12,10 @@ from turbopi.cli.capabilities import check_server, check_warmup
 from turbopi.cli.files import check_folder
 from turbopi.cli.fleet_update import Requested
 from turbopi.cli.framework import Output, command, log_to_stderr
-from turbopi.cli.options import ActingOptions, CheckpointArgument
+from turbopi.cli.options import COMMON, ActingOptions, CheckpointArgument
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
+from turbopi.cli.settings import PrintSettings, Settings, print_settings
 from turbopi.serve.options import MAX_BATCH, ServerOptions
 from turbopi.support.errors import ConfigError
 
@@ -23,11 +24,19 @@ if TYPE_CHECKING:
 
     from turbopi.policy.policy import UnifiedPolicy
     from turbopi.realtime.running_chunk import JoinMode
+    from turbopi.recordings.format import RecordImages
+
+_NETWORK, _QUEUE = "Network", "Queue, batches, warm-up"
+_REAL_TIME, _RECORDING = "Real-time execution", "Recording"
 
 
 @command(
     "serve",
     shared=ActingOptions,
+    common=(
+        *("--host", "--port", "--api-key-file", "--record", "--max-batch", "--execution", "--control-hz"),
+        *("--settings", "--print-settings", *COMMON),
+    ),
     examples=(
         "turbopi serve checkpoints/pi05_libero --config pi05_libero",
         "turbopi serve checkpoints/mine --host 0.0.0.0 --api-key-file key",
@@ -35,6 +44,7 @@ if TYPE_CHECKING:
         "turbopi serve checkpoints/mine --execution rtc --control-hz 50",
         "turbopi serve checkpoints/mine --max-batch 16 --deadline-ms 200",
         "turbopi serve --random-weights pi05_tiny --port 8001",
+        "turbopi serve --settings robot.toml",
         "turbopi serve checkpoints/mine --ray --gpus all",
     ),
 )
@@ -43,16 +53,20 @@ def serve(
     context: typer.Context,
     checkpoint: CheckpointArgument = None,
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="0.0.0.0 lets other machines in.")
+        str, typer.Option("--host", rich_help_panel=_NETWORK, metavar="HOST", help="0.0.0.0 lets other machines in.")
     ] = ServerOptions.host,
     port: Annotated[
-        int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="0 takes a free one.")
+        int,
+        typer.Option(
+            "--port", "-p", rich_help_panel=_NETWORK, min=0, max=65535, metavar="N", help="0 takes a free one."
+        ),
     ] = ServerOptions.port,
     api_key: ApiKey = None,
     api_key_file: Annotated[
         Path | None,
         typer.Option(
             "--api-key-file",
+            rich_help_panel=_NETWORK,
             metavar="FILE",
             help="Clients must send `Authorization: Api-Key KEY`; the file's one line is the key. The variable "
             "TURBOPI_API_KEY does the same.",
@@ -62,20 +76,28 @@ def serve(
         str | None,
         typer.Option(
             "--allowed-hosts",
+            rich_help_panel=_NETWORK,
             metavar="NAME,NAME",
             help="Names, besides this machine's, by which web pages may address the server. Robots need none.",
         ),
     ] = None,
     max_message_mb: Annotated[
-        float, typer.Option("--max-message-mb", metavar="MB", help="Larger messages end the connection.")
+        float,
+        typer.Option(
+            "--max-message-mb", rich_help_panel=_NETWORK, metavar="MB", help="Larger messages end the connection."
+        ),
     ] = ServerOptions.max_message_mb,
     queue_limit: Annotated[
-        int, typer.Option("--queue-limit", min=0, metavar="N", help="Requests that may wait while one runs.")
+        int,
+        typer.Option(
+            "--queue-limit", rich_help_panel=_QUEUE, min=0, metavar="N", help="Requests that may wait while one runs."
+        ),
     ] = ServerOptions.queue_limit,
     max_batch: Annotated[
         int | None,
         typer.Option(
             "--max-batch",
+            rich_help_panel=_QUEUE,
             min=1,
             max=MAX_BATCH,
             metavar="N",
@@ -87,21 +109,55 @@ def serve(
         float,
         typer.Option(
             "--deadline-ms",
+            rich_help_panel=_QUEUE,
             metavar="MS",
             help="From a request to its answer, for robots that don't send their own: it sets the order only, nothing "
             "is refused for it.",
         ),
     ] = ServerOptions.deadline_ms,
     max_clients: Annotated[
-        int, typer.Option("--max-clients", min=1, metavar="N", help="Connected at once; more are refused (HTTP 503).")
+        int,
+        typer.Option(
+            "--max-clients",
+            rich_help_panel=_NETWORK,
+            min=1,
+            metavar="N",
+            help="Connected at once; more are refused (HTTP 503).",
+        ),
     ] = ServerOptions.max_clients,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
+        Path | None,
+        typer.Option(
+            "--record",
+            rich_help_panel=_RECORDING,
+            metavar="DIR",
+            help="Write every observation and its actions below DIR.",
+        ),
     ] = None,
+    record_limit: Annotated[
+        str | None,
+        typer.Option(
+            "--record-limit",
+            metavar="SIZE,AGE",
+            rich_help_panel=_RECORDING,
+            help="What stays below DIR, such as 20GB, 7d or 20GB,7d: the oldest calls are removed, and the log says "
+            "how many. Unless given, all stays.",
+        ),
+    ] = None,
+    record_images: Annotated[
+        str,
+        typer.Option(
+            "--record-images",
+            metavar="exact|png|jpeg",
+            rich_help_panel=_RECORDING,
+            help="png: the same pixels, smaller; jpeg: far smaller, pixels nearly the same.",
+        ),
+    ] = ServerOptions.record_images,
     page: Annotated[
         bool | None,
         typer.Option(
             "--page/--no-page",
+            rich_help_panel=_NETWORK,
             help="A page for your browser on the same port: robots, images, action chunks, latency.",
             show_default="on, unless others could see it without an API key",
         ),
@@ -110,6 +166,7 @@ def serve(
         str | None,
         typer.Option(
             "--execution",
+            rich_help_panel=_REAL_TIME,
             metavar="WAY",
             help="Join each client's chunks, without any change of the client: rtc, rtc_identity or rtc_trained, "
             "with --control-hz. See docs/real_time.md",
@@ -117,12 +174,18 @@ def serve(
     ] = None,
     control_hz: Annotated[
         float | None,
-        typer.Option("--control-hz", metavar="HZ", help="Actions that the robots carry out in a second."),
+        typer.Option(
+            "--control-hz",
+            rich_help_panel=_REAL_TIME,
+            metavar="HZ",
+            help="Actions that the robots carry out in a second.",
+        ),
     ] = None,
     execution_horizon: Annotated[
         int | None,
         typer.Option(
             "--execution-horizon",
+            rich_help_panel=_REAL_TIME,
             min=1,
             metavar="S",
             help="Actions of a chunk that the robots carry out before the next takes over. Default: half of a chunk.",
@@ -132,6 +195,7 @@ def serve(
         int | None,
         typer.Option(
             "--delay-steps",
+            rich_help_panel=_REAL_TIME,
             min=0,
             metavar="D",
             help="Control steps from an observation to its chunk, at the robot; 0 if it stands still meanwhile. "
@@ -142,13 +206,20 @@ def serve(
         bool,
         typer.Option(
             "--warmup/--no-warmup",
+            rich_help_panel=_QUEUE,
             help="Compile and capture, before the first client, for every number of cameras that the robot may send.",
         ),
     ] = True,
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="Refuse requests that warm-up didn't cover, which would take a second or more."),
+        typer.Option(
+            "--strict",
+            rich_help_panel=_QUEUE,
+            help="Refuse requests that warm-up didn't cover, which would take a second or more.",
+        ),
     ] = False,
+    settings: Settings = None,
+    print_all: PrintSettings = False,
     ray: Ray = False,
     replicas: Replicas = None,
     gpus: Gpus = None,
@@ -161,6 +232,9 @@ def serve(
     Speaks openpi's websocket protocol; /healthz, /metrics (Prometheus) and a page for people answer on the same port.
     Ctrl-C finishes the inference that runs, then stops.
     """
+    if print_all:
+        print_settings(context)
+        return
     output = Output()
     options.check(checkpoint)
     wishes = FleetWishes(ray, replicas, gpus, fleet, autoscaling, update)
@@ -176,6 +250,8 @@ def serve(
         max_batch=max_batch,
         deadline_ms=deadline_ms,
         record_dir=record,
+        record_limit=record_limit,
+        record_images=cast("RecordImages", record_images),  # checked there
         allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,
         page=page,
@@ -194,7 +270,7 @@ def serve(
             "note: `ps` shows a key on the command line to all; --api-key-file or TURBOPI_API_KEY hides it", "yellow"
         )
     if ray:
-        given = [name for name in context.params if _was_given(context, name)]
+        given = [name for name in context.params if name != "settings" and _was_given(context, name)]
         requested = Requested(options, wanted, warmup, strict)
         serve_fleet(wishes, requested, checkpoint, output, given=given, before_serving=_log_all)
         return
@@ -210,9 +286,9 @@ def serve(
 
 
 def _was_given(context: typer.Context, name: str) -> bool:
-    """Whether an option is on the command line, be it with its default."""
+    """Whether an option is on the command line or in --settings, be it with its default."""
     source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
+    return source is not None and source.name in ("COMMANDLINE", "DEFAULT_MAP")
 
 
 def _log_all() -> None:

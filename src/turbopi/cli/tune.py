@@ -82,7 +82,7 @@ def tune(
     if checkpoint is None and options.random_weights is None:
         options = WeightOptions(SIZES, options.weights_seed, options.config)
     resolved = usable_device(device)
-    config = options.open(checkpoint).config.model
+    config = options.open(checkpoint).config.planned_model
     from turbopi.backends.tuned_tiles import Machine, find_tiles, own_file, write_tile_file
     from turbopi.kernels.tile_table import NO_TILES, TileTable
     from turbopi.tune import plan as planning
@@ -207,6 +207,7 @@ def measure(
         ),
         lambda begin, advance: Progress(begin, advance, done),
         output,
+        first="preparing",
     )
 
 

@@ -27,6 +27,8 @@ OF_SERVERS = {
     "max_batch": "--max-batch",
     "deadline_ms": "--deadline-ms",
     "record_dir": "--record",
+    "record_limit": "--record-limit",
+    "record_images": "--record-images",
     "allowed_hosts": "--allowed-hosts",
     "max_clients": "--max-clients",
     "page": "--page",

@@ -48,7 +48,11 @@ def verify(
     count: Annotated[
         int | None,
         typer.Option(
-            "--count", min=1, metavar="N", help="Observations, evenly spread over PATH.", show_default="8, or all"
+            "--count",
+            min=1,
+            metavar="N",
+            help="Observations, evenly spread over PATH; first those that the calibration wasn't made on.",
+            show_default="8, or all",
         ),
     ] = None,
     noises: Annotated[
@@ -99,6 +103,9 @@ def verify(
     _show(document, output)
     if report is not None:
         _write(document, report, output)
+    output.line(
+        "This judges the backend, not the robot's set-up: units, cameras and statistics are `turbopi replay`'s.", "dim"
+    )
     output.line(document.verdict, "bold green" if document.ok else "bold red")
     output.document(document)
     if not document.ok:
@@ -130,7 +137,8 @@ def _show(document: "Certificate", output: Output) -> None:
         reported = as_document(document.calibrated, CalibrationDetails, "the policy's calibration")
         output.line(_calibration(reported, document.precision))
         seen = observed.calibrated_on
-        output.line(f"{seen} of {observed.count} observations were calibrated on", "yellow" if seen else None)
+        said = "; record others, as on these the error looks too small" if seen else ""
+        output.line(f"{seen} of {observed.count} observations were calibrated on{said}", "yellow" if seen else None)
     output.table(_intermediates(document))
     output.line(
         f"Where a name has layers or steps, the worst, with its number. Control: {document.control}. The error of "

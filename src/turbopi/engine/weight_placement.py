@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.models import family_of
-from turbopi.models.pi0.reference import parameter_shapes
+from turbopi.models import family_of, parameter_shapes
 
 HOST = torch.device("cpu")
 QKV, GATE_UP = ("q_proj", "k_proj", "v_proj"), ("gate_proj", "up_proj")  # what is joined, in this order

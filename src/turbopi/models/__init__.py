@@ -3,12 +3,24 @@
 `observation.py` is what all of them take.
 """
 
-from turbopi.config import Kind, ModelConfig
+import torch
+
+from turbopi.config import PRESETS, Kind, Network, PolicyConfig
 from turbopi.models.family import Family
 from turbopi.models.pi0.family import PI0, PI05
+from turbopi.models.smolvla.family import BASE, SMOLVLA
 
-FAMILIES: dict[Kind, Family] = {one.kind: one for one in (PI05, PI0)}
+FAMILIES: dict[Kind, Family] = {one.kind: one for one in (PI05, PI0, SMOLVLA)}
+
+RANDOM: dict[str, PolicyConfig] = {**PRESETS, BASE.name: BASE}  # what random weights are made for, by name
 
 
-def family_of(config: ModelConfig) -> Family:
+def family_of(config: Network) -> Family:
     return FAMILIES[config.kind]
+
+
+def parameter_shapes(config: Network) -> dict[str, tuple[int, ...]]:
+    """Canonical name -> shape of every parameter of a model."""
+    with torch.device("meta"):
+        model = family_of(config).reference(config)
+    return {name: tuple(parameter.shape) for name, parameter in model.state_dict().items()}

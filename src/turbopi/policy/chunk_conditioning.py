@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from turbopi.backends import Backend
-from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.config import Network, PolicyConfig
 from turbopi.engine.loops import batch_form
 from turbopi.models.pi0.conditioning import (
     Conditioning,
@@ -234,7 +234,7 @@ def flags(what: str, given: bool | Sequence[bool], rows: int) -> list[bool]:
     return list(each)
 
 
-def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:
+def _example(form: Form, num_steps: int, horizon: int, model: Network) -> Conditioning:
     """A conditioning of a form, for a warm-up."""
     nothing = np.zeros((horizon, model.action_dim), np.float32)
     if form == "tokens":

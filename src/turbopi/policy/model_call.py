@@ -54,7 +54,7 @@ class ModelCall:
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
     ) -> Ran:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        if self._backend.runs_batches:
+        if self._backend.begins:
             return self._begin(observations, joins, noise)
         each = [self._pipeline.see(obs) for obs in observations]
         inputs = Observation.stack([self._pipeline.complete(seen) for seen in each])

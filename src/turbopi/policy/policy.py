@@ -18,6 +18,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig, Solver, TimeGrid
+from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.reference import FloatPrecision
@@ -37,7 +38,7 @@ from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
 from turbopi.policy.watch import PolicyWatch
 from turbopi.preprocess.pipeline import Pipeline
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.robots import Robot
@@ -47,7 +48,9 @@ logger = logging.getLogger(__name__)
 
 
 class UnifiedPolicy:
-    """A Pi0.5 or Pi0 policy over any backend: observation in, action chunk out, as openpi computes it.
+    """A policy over any backend: observation in, action chunk out, as its owner's code computes it.
+
+    Pi0.5 and Pi0 as openpi and LeRobot, SmolVLA as LeRobot.
 
         policy = UnifiedPolicy("checkpoints/pi05_libero", config="pi05_libero")
         actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
@@ -56,7 +59,7 @@ class UnifiedPolicy:
         checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or an open `Checkpoint`.
         config: what no checkpoint records: a preset's name, a .json, a PolicyConfig, or "auto" for LeRobot's own config
             or the `turbopi.json` beside the weights.
-        backend: a name from `turbopi backends`; "auto" takes the fastest one available (see `metadata`).
+        backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`).
         precision: "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8" (docs/quantization.md).
         quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
         num_denoising_steps: evaluations of the action expert in a call. None: the config's.
@@ -65,7 +68,7 @@ class UnifiedPolicy:
             which determine the number of steps. None: the config's.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
-            the checkpoint folder or in openpi's cache.
+            the checkpoint folder or in openpi's cache; SmolVLA's in the folder or the Hub's cache (tokenizer.json).
         default_prompt: for observations without a prompt.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
@@ -100,23 +103,17 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         self._device = backends.resolve_device(device)
-        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
-        backends.check(name, self._device, precision)  # before a calibration is asked for, and weights are read
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
+        backends.check(name, self._device, precision)  # before a calibration is looked for, and weights are read
 
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
-        if checkpoint.format == "random" and tokenizer is None:
-            tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
-        self.config = checkpoint.config
+        self.config, model = checkpoint.config, checkpoint.config.model
+        if backend == "auto" and not family_of(model).planned:
+            name, why = backends.choose(self._device, precision, model)
         self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
-        prompt_tokenizer = load_tokenizer(
-            tokenizer,
-            checkpoint_dir=checkpoint.path,
-            named=checkpoint.named_tokenizer,
-            candidates=checkpoint.tokenizer_candidates,
-            vocab_size=checkpoint.config.model.vocab_size,
-        )
+        prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
         self._checks = Checks(
             self._pipeline, checkpoint.norm_stats, out_of_range, judges_ranges=checkpoint.format != "random"
@@ -137,7 +134,7 @@ class UnifiedPolicy:
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
-                name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
+                name, model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)

@@ -6,10 +6,12 @@ Two ways, because a model must see images resized as they were in its training:
 - LeRobot's: float32 in [0, 1]; bilinear without averaging; black padding; then [-1, 1]. LeRobot 0.4 padded with -1
   before that, so with -3 after it.
 
-Both keep the aspect ratio and centre the image. Sources: openpi's `image_tools.py` and policies; LeRobot's
-`vla_utils.resize_with_pad_torch` and `PI05Policy._preprocess_images` (0.6.1).
+Both keep the aspect ratio and centre the image; LeRobot's SmolVLA pads left and top alone, and clamps nothing. Sources:
+openpi's `image_tools.py` and policies; LeRobot's `vla_utils.resize_with_pad_torch`, `PI05Policy._preprocess_images` and
+`SmolVLAPolicy.prepare_images` (0.6.1).
 """
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +21,7 @@ from functools import cache, lru_cache
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from turbopi.config import ImageResize
 from turbopi.support.errors import ObservationError
@@ -26,17 +29,24 @@ from turbopi.support.errors import ObservationError
 
 @dataclass(frozen=True)
 class _Way:
-    """float_images: the model gets float32 in [-1, 1], else uint8. padding: around an image, as the model gets it."""
+    """float_images: the model gets float32 in [-1, 1], else uint8. padding: around an image, as the model gets it.
+
+    low, high  where a resized image in [0, 1] is clamped
+    centred    else the image is at the bottom right
+    """
 
     float_images: bool
     padding: int
-    low: float  # where a resized image in [0, 1] is clamped from below
+    low: float = 0.0
+    high: float = 1.0
+    centred: bool = True
 
 
 RESIZES: dict[ImageResize, _Way] = {
-    "openpi": _Way(False, 0, 0.0),
-    "lerobot": _Way(True, -1, 0.0),
-    "lerobot_0.4": _Way(True, -3, -1.0),
+    "openpi": _Way(False, 0),
+    "lerobot": _Way(True, -1),
+    "lerobot_0.4": _Way(True, -3, low=-1.0),
+    "lerobot_smolvla": _Way(True, -1, low=-math.inf, high=math.inf, centred=False),
 }
 
 
@@ -52,7 +62,7 @@ def fitted(camera_image: np.ndarray, size: int, resize: ImageResize) -> np.ndarr
     if camera_image.shape != out.shape:
         out.fill(way.padding)  # which stays where the image doesn't reach
     if way.float_images:
-        resize_unit_into(camera_image, out, low=way.low)
+        resize_unit_into(camera_image, out, way)
     else:
         resize_into(camera_image, out)
     return out
@@ -132,11 +142,10 @@ def copy_image(image: np.ndarray, out: np.ndarray) -> None:
         out[..., channel] = image[..., channel]
 
 
-def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) -> None:
+def resize_unit_into(image: np.ndarray, out: np.ndarray, way: _Way = RESIZES["lerobot"]) -> None:
     """LeRobot's way: one image in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds the padding.
 
     image   uint8[h, w, 3], divided by 255 first, or float32[h, w, 3] in [0, 1]
-    low     where a resized image is clamped from below: 0, in LeRobot 0.4 -1
     """
     planes = np.empty((3, *image.shape[:2]), np.float32)  # by channel: torch's layout, and faster than a transpose
     for channel in range(3):
@@ -145,18 +154,34 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
         else:
             planes[channel] = image[..., channel]
     if image.shape != out.shape:
-        rows, columns = placement(image.shape, out.shape)
+        rows, columns = placement(image.shape, out.shape, way.centred)
         out = out[rows, columns]
         tensor = torch.from_numpy(planes)[None]
         resized = torch.nn.functional.interpolate(tensor, size=out.shape[:2], mode="bilinear", align_corners=False)
-        planes = resized[0].clamp_(low, 1.0).numpy()
+        planes = resized[0].clamp_(way.low, way.high).numpy()
     for channel in range(3):
         out[..., channel] = planes[channel] * np.float32(2) - np.float32(1)
 
 
+def fit_unit(images: Tensor, size: tuple[int, int], resize: ImageResize) -> Tensor:
+    """LeRobot's ways on any device: float32[B, h, w, 3] in [0, 1] to float32[B, *size, 3] in [-1, 1]."""
+    way = RESIZES[resize]
+    out = torch.full((len(images), *size, 3), float(way.padding), device=images.device)
+    if out.shape == images.shape:
+        return images * 2 - 1
+    rows, columns = placement(tuple(images.shape[1:]), tuple(out.shape[1:]), way.centred)
+    within = (rows.stop - rows.start, columns.stop - columns.start)
+    planes = images.permute(0, 3, 1, 2)
+    planes = torch.nn.functional.interpolate(planes, size=within, mode="bilinear", align_corners=False)
+    out[:, rows, columns] = (planes.clamp(way.low, way.high) * 2 - 1).permute(0, 2, 3, 1)
+    return out
+
+
 @lru_cache(maxsize=16)  # the same few in every call
-def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, slice]:
+def placement(shape: tuple[int, ...], target: tuple[int, ...], centred: bool = True) -> tuple[slice, slice]:
     """Rows and columns of a `target`-sized frame that an image of `shape` fills, its aspect ratio kept.
+
+    centred  else it is at the bottom right
 
     Raises ObservationError if nothing of it would be left.
     """
@@ -167,5 +192,7 @@ def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, s
             f"an image of {shape[0]}x{shape[1]} pixels is too narrow: resized to {target[0]}x{target[1]} "
             f"with its aspect ratio kept, nothing of it is left"
         )
-    top, left = (target[0] - h) // 2, (target[1] - w) // 2
+    top, left = target[0] - h, target[1] - w
+    if centred:
+        top, left = top // 2, left // 2
     return slice(top, top + h), slice(left, left + w)

@@ -109,7 +109,7 @@ class Pipeline:
         # Whether actions become absolute as in LeRobot: by the state that came, in float32.
         scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
         self._adds_raw_state = mask is not None and scaled_by_lerobot
-        self._image_shape = (config.model.vision.image_size,) * 2
+        self._image_shape = (config.model.image_size,) * 2
         self._float_images = RESIZES[config.image_resize].float_images
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
         self.before_vision: tuple[Callable[[Incoming], None], ...] = (
@@ -290,8 +290,8 @@ class Pipeline:
         sample.prompt = read_prompt(prompt)
 
     def _normalize_state(self, sample: Incoming) -> None:
-        state, limit = read_state(sample.robot.state, "state", self.robot.state_dim), self.config.model.action_dim
-        if len(state) > limit and family_of(self.config.model).state_token:
+        state, limit = read_state(sample.robot.state, "state", self.robot.state_dim), self.config.model.state_dim
+        if len(state) > limit and family_of(self.config.model).reads_state:
             raise ObservationError(f"the state has {len(state)} values, but the model takes at most {limit}")
         sample.state = self.state_scale.normalize(state)
 
@@ -333,11 +333,11 @@ class Pipeline:
         )
 
     def _pad_state(self, sample: Incoming) -> None:
-        width = self.config.model.action_dim
-        sample.state = pad_last(sample.state, max(width, self.state_scale.width or 0))
+        model = self.config.model
+        sample.state = pad_last(sample.state, max(model.action_dim, model.state_dim, self.state_scale.width or 0))
         with np.errstate(over="ignore"):
             state = sample.state.astype(np.float32)
-        sample.model_state = state[:width]
+        sample.model_state = state[: model.state_dim]
         if not all_finite(state):
             at = int(np.flatnonzero(~np.isfinite(state))[0])
             raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
@@ -385,11 +385,15 @@ class Pipeline:
     def _check(self) -> None:
         """Refuse now what would otherwise fail, or go wrong in silence, at the first observation."""
         config, robot, limit = self.config, self.robot, self.config.model.action_dim
-        if config.discrete_state_input and family_of(config.model).state_token:
-            raise ConfigError(f"{config.name}: only Pi0.5 reads the state from the prompt; Pi0 needs it set to false")
+        family = family_of(config.model)
+        if config.discrete_state_input and family.reads_state:
+            raise ConfigError(
+                f"{config.name}: discrete_state_input is true, but {family.label} doesn't read the state from the "
+                "prompt; set it to false"
+            )
         if config.image_resize not in RESIZES:
             raise ConfigError(
-                f"{config.name}: image_resize is openpi or lerobot or lerobot_0.4, not {config.image_resize!r}"
+                f"{config.name}: image_resize is {config.image_resize!r}; expected {' or '.join(RESIZES)}"
             )
         dims = (("state", robot.state_dim, self.state_scale), ("actions", robot.action_dim, self.action_scale))
         if robot.delta_mask is not None and len(robot.delta_mask) > limit:
@@ -398,7 +402,8 @@ class Pipeline:
                 f"have {limit}"
             )
         for name, width, scale in dims:
-            limited = name == "actions" or family_of(config.model).state_token  # no other weight depends on the width
+            limited = name == "actions" or family.reads_state  # no other weight depends on the width
+            limit = config.model.action_dim if name == "actions" else config.model.state_dim
             if width is not None and limited and width > limit:
                 raise ConfigError(f"robot {robot.name} has {width} values of {name}, but the model takes {limit}")
             if scale.width is None:

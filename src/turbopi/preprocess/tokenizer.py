@@ -13,6 +13,9 @@ from typing import Protocol
 import numpy as np
 import sentencepiece
 
+from turbopi.checkpoint import Checkpoint
+from turbopi.models import family_of
+from turbopi.preprocess.hub_tokenizer import HubTokenizer
 from turbopi.preprocess.tokenizer_json import TOKENIZER_JSON, TokenizerJson, differing_piece
 from turbopi.support.errors import ObservationError, TokenizerError
 from turbopi.support.files import openpi_cache
@@ -116,23 +119,28 @@ class PromptTokenizer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
-        `as_is`, `labels`: see `encode`. A longer prompt loses its end, as in openpi; a warning is logged once for each.
+        `as_is`, `labels`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
+        `truncation_side` says; a warning is logged once for each.
         """
         ids = self.encode(prompt, state, as_is=as_is, labels=labels)
         count = min(len(ids), max_tokens)
         if count < len(ids):
-            self._warn_truncated(prompt, len(ids), max_tokens, state is not None)
+            left = getattr(self.encoder, "truncation_side", "right") == "left"
+            self._warn_truncated(prompt, len(ids), max_tokens, state is not None, left)
+            ids = ids[-count:] if left else ids[:count]
         tokens = np.zeros(max_tokens, np.int64)
-        tokens[:count] = ids[:count]
+        tokens[:count] = ids
         mask = np.zeros(max_tokens, np.bool_)
         mask[:count] = True
         return tokens, mask
 
-    def _warn_truncated(self, prompt: str, length: int, max_tokens: int, has_state: bool) -> None:
+    def _warn_truncated(self, prompt: str, length: int, max_tokens: int, has_state: bool, left: bool) -> None:
         if prompt == self._truncated_prompt:  # once, not at every step of an episode
             return
         self._truncated_prompt = prompt
-        lost = "the state, which is at the end, is cut" if has_state else "its end is cut"
+        lost = f"its {'beginning' if left else 'end'} is cut"
+        if has_state and not left:
+            lost = "the state, which is at the end, is cut"
         logger.warning(
             "the prompt takes %d tokens but the model reads %d: %s. Shorten the prompt: %r",
             length,
@@ -149,6 +157,7 @@ def load_tokenizer(
     checkpoint_dir: str | Path | None = None,
     named: Path | None = None,
     candidates: Iterable[str | Path] = (),
+    paligemma: bool = True,
 ) -> PromptTokenizer:
     """The tokenizer from the first of: `source`; `checkpoint_dir`; `named`; `candidates`; openpi's cache.
 
@@ -159,6 +168,8 @@ def load_tokenizer(
     named           the folder of the tokenizer that a LeRobot checkpoint's processors name. One from another place is
                     compared with it: a warning is logged where they differ
     candidates      further files
+    paligemma       False: of a family with tokenizers of its own: a tokenizer.json of any kind, from `source`, `named`
+                    or `candidates` alone
     openpi's cache  $OPENPI_DATA_HOME/big_vision/paligemma_tokenizer.model; ~/.cache/openpi if that isn't set
 
     Raises TokenizerError if there is none (saying where to get it), if the first one can't be read, or if it has more
@@ -168,6 +179,8 @@ def load_tokenizer(
         if not callable(getattr(source, "encode", None)):
             raise TokenizerError(f"tokenizer {source!r} has no encode(text, add_bos) method")
         return PromptTokenizer(source, vocab_size=vocab_size, source=type(source).__name__)
+    if not paligemma:
+        return _own_tokenizer(source, vocab_size, [*([] if named is None else [named]), *map(Path, candidates)])
     own = [] if named is None else [named / TOKENIZER_JSON, named / FILE_NAMES[0]]  # in transformers' order
     places = _places(checkpoint_dir, [*own, *candidates])
     if source is None:
@@ -187,6 +200,36 @@ def load_tokenizer(
         if other != cached_tokenizer() and not other.samefile(there[0]):
             _compare(found, other)
     return found
+
+
+def tokenizer_of(checkpoint: Checkpoint, given: str | Path | Encoder | None = None) -> PromptTokenizer:
+    """A checkpoint's, unless another is `given`; random weights know no word, so any will do."""
+    model, wordless = checkpoint.config.model, checkpoint.format == "random" and given is None
+    return load_tokenizer(
+        TINY_TOKENIZER if wordless else given,
+        checkpoint_dir=checkpoint.path,
+        named=checkpoint.named_tokenizer,
+        candidates=checkpoint.tokenizer_candidates,
+        vocab_size=model.vocab_size,
+        paligemma=wordless or family_of(model).paligemma,
+    )
+
+
+def _own_tokenizer(source: str | Path | None, vocab_size: int, places: Sequence[Path]) -> PromptTokenizer:
+    looked = [one / TOKENIZER_JSON if one.suffix != ".json" else one for one in places if one.suffix != ".model"]
+    if source is not None:
+        given = Path(source).expanduser()
+        looked = [given / TOKENIZER_JSON if given.is_dir() else given]
+    file = next((one for one in looked if one.is_file()), None)
+    if file is None:
+        raise TokenizerError(
+            f"no tokenizer found. Looked for {', '.join(map(str, looked))}. Fetch the one that the checkpoint was "
+            "trained with: `hf download NAME tokenizer.json tokenizer_config.json`, where NAME is the tokenizer_name "
+            "in the checkpoint's policy_preprocessor.json; or give tokenizer= its folder"
+        )
+    encoder = HubTokenizer(file)
+    _check_size(file, encoder.size, vocab_size)
+    return PromptTokenizer(encoder, vocab_size=vocab_size, source=str(file))
 
 
 def _given_file(path: Path) -> Path:
@@ -259,6 +302,11 @@ def _not_found(places: Sequence[Path]) -> str:
 
 def _open(path: Path, vocab_size: int) -> PromptTokenizer:
     encoder, pieces = _encoder(path)
+    _check_size(path, pieces, vocab_size)
+    return PromptTokenizer(encoder, vocab_size=vocab_size, source=str(path))
+
+
+def _check_size(path: Path, pieces: int, vocab_size: int) -> None:
     if pieces > vocab_size:
         raise TokenizerError(
             f"{path} has {pieces} pieces, but the model's vocabulary has {vocab_size} entries; "
@@ -271,7 +319,6 @@ def _open(path: Path, vocab_size: int) -> PromptTokenizer:
             pieces,
             vocab_size,
         )
-    return PromptTokenizer(encoder, vocab_size=vocab_size, source=str(path))
 
 
 def _encoder(path: Path) -> tuple[Encoder, int]:

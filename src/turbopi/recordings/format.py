@@ -10,17 +10,21 @@ keys alone can't be split again, since openpi's own keys contain "/".
 
     node = {"dict": [[key, node], ...]} | {"list": [node, ...]} | {"array": member} | {"scalar": member}
          | {"bytes": base64} | {"value": string, number, boolean or null}
+         | {"image": member} | {"image_chw": member}
+
+An image is uint8[h, w, 3], or [3, h, w], whose member holds a PNG or JPEG file. Files with images are of version 2.
 
 A folder with an `observation.json` is an observation written by hand: see observation_folder.py.
 """
 
 import base64
+import io
 import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -31,7 +35,11 @@ from turbopi.support.reading import Npz, is_finite, listing, parse_json, shown
 from turbopi.support.reading.arrays import is_unicode
 
 FORMAT = "turbopi-recording"
-VERSION = 1
+VERSION, WITH_IMAGES = 1, 2
+
+RecordImages = Literal["exact", "png", "jpeg"]
+RECORD_IMAGES: tuple[RecordImages, ...] = get_args(RecordImages)
+_SAVED = {"png": {"compress_level": 1}, "jpeg": {"quality": 95, "subsampling": 0}}
 
 
 @dataclass(frozen=True)
@@ -46,14 +54,19 @@ class RecordedCall:
 # --- one call ---------------------------------------------------------------------------------------------------------
 
 
-def save_call(path: Path, call: RecordedCall) -> None:
-    """Write `call`, whole or not at all. Raises OutputError, and ObservationError for what can't be stored."""
+def save_call(path: Path, call: RecordedCall, images: RecordImages = "exact") -> None:
+    """Write `call`, whole or not at all. Raises OutputError, and ObservationError for what can't be stored.
+
+    images  how the observation's are written: as they are, "png" (the same pixels, smaller and slower), or "jpeg" (far
+            smaller, pixels nearly the same)
+    """
     members: dict[str, np.ndarray] = {}
+    observation = _to_node(call.observation, "observation", members, images)
     index = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if images == "exact" else WITH_IMAGES,
         "time": call.time,
-        "observation": _to_node(call.observation, "observation", members),
+        "observation": observation,
         "result": _to_node(call.result, "result", members),
     }
     members["index"] = np.frombuffer(json.dumps(index).encode(), np.uint8)
@@ -75,10 +88,10 @@ def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Recorded
         members["index"].tobytes(), f"{path} has a damaged index: it", ObservationError, depth=200, nan=True
     )
     try:
-        if index["format"] != FORMAT or index["version"] != VERSION:
+        if index["format"] != FORMAT or index["version"] not in (VERSION, WITH_IMAGES):
             raise ObservationError(
                 f"{path} is a {shown(index['format'])} of version {shown(index['version'])}; this reads {FORMAT} of "
-                f"version {VERSION}"
+                f"version {VERSION} or {WITH_IMAGES}"
             )
         observation = _from_node(index["observation"], members)
         answer = _from_node(index["result"], members) if result else {}
@@ -92,14 +105,16 @@ def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Recorded
         raise ObservationError(f"{path} has a damaged index: {type(error).__name__} {reason}") from error
 
 
-def _to_node(value: object, name: str, members: dict[str, np.ndarray]) -> dict[str, object]:
+def _to_node(
+    value: object, name: str, members: dict[str, np.ndarray], images: RecordImages = "exact"
+) -> dict[str, object]:
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str):
                 raise ObservationError(f"can't record the key {key!r} in {name}: keys must be strings")
-        return {"dict": [[key, _to_node(item, f"{name}/{key}", members)] for key, item in value.items()]}
+        return {"dict": [[key, _to_node(item, f"{name}/{key}", members, images)] for key, item in value.items()]}
     if isinstance(value, list | tuple):
-        return {"list": [_to_node(item, f"{name}/{i}", members) for i, item in enumerate(value)]}
+        return {"list": [_to_node(item, f"{name}/{i}", members, images) for i, item in enumerate(value)]}
     if isinstance(value, bytes):
         return {"bytes": base64.b64encode(value).decode()}
     if value is None or isinstance(value, str | bool | int | float):
@@ -108,9 +123,29 @@ def _to_node(value: object, name: str, members: dict[str, np.ndarray]) -> dict[s
         array, member = np.asarray(value), _member_name(name, members)
         if array.dtype.kind == "U" and not is_unicode(array.tobytes(), array.dtype):  # reading would refuse it
             raise ObservationError(f"can't record {name}: its text holds half a Unicode character, or what is none")
+        kind = None if images == "exact" else _image_kind(array)
+        if kind is not None:
+            members[member] = _encoded(array if kind == "image" else array.transpose(1, 2, 0), images)
+            return {kind: member}
         members[member] = array
         return {"array" if isinstance(value, np.ndarray) else "scalar": member}
     raise ObservationError(f"can't record {name}: it is a {type(value).__name__}")
+
+
+def _image_kind(array: np.ndarray) -> str | None:
+    """What an array is written as, if it is an image."""
+    if array.dtype != np.uint8 or array.ndim != 3 or not array.size:
+        return None
+    return "image" if array.shape[2] == 3 else "image_chw" if array.shape[0] == 3 else None
+
+
+def _encoded(pixels: np.ndarray, images: RecordImages) -> np.ndarray:
+    """uint8[n], the file of an image uint8[h, w, 3]."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, images.upper(), **_SAVED[images])
+    return np.frombuffer(stream.getvalue(), np.uint8)
 
 
 def _member_name(name: str, taken: dict[str, np.ndarray]) -> str:
@@ -143,6 +178,11 @@ def _from_node(node: Any, members: Mapping[str, np.ndarray]) -> Any:
             return base64.b64decode(content, validate=True)
         case "array", str():
             return members[content]
+        case (("image" | "image_chw"), str()):
+            from turbopi.support.reading.images import decode_image
+
+            pixels = decode_image(io.BytesIO(members[content].tobytes()), content)
+            return pixels if kind == "image" else np.ascontiguousarray(pixels.transpose(2, 0, 1))
         case "scalar", str():
             scalar = members[content]
             if scalar.ndim:

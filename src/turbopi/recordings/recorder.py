@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from turbopi.recordings.format import FORMAT, VERSION, RecordedCall, save_call
+from turbopi.recordings.format import FORMAT, VERSION, RecordedCall, RecordImages, save_call
+from turbopi.recordings.limit import RecordLimit, Trimmed
 from turbopi.support.errors import ConfigError, OutputError
 from turbopi.support.files import append_line, write_whole
 
@@ -22,7 +23,10 @@ class Recorder:
     At most `queue_calls` calls or `queue_bytes` bytes wait for the disk; what comes beyond is dropped, and counted in
     `dropped`. A call that can't be written (disk full, folder gone) is counted in `failed` and leaves a gap in the
     numbers; the next one is tried again. A line of the index that can't be written comes with a later one.
-    `count` is called with "written", "dropped" or "failed", from any thread.
+    `count` is called with "written", "dropped", "failed" or "removed", from any thread.
+
+    limit   what stays below `record_dir` (limit.py); None: everything
+    images  as for `save_call`
 
     Raises ConfigError if the folder can't be made now.
     """
@@ -35,9 +39,11 @@ class Recorder:
         queue_calls: int = 256,
         queue_bytes: int = 256 * 2**20,
         count: Callable[[str], None] = lambda outcome: None,
+        limit: RecordLimit | None = None,
+        images: RecordImages = "exact",
     ) -> None:
         self.written = self.dropped = self.failed = 0
-        self._count = count
+        self._count, self._images = count, images
         self._queue_bytes = queue_bytes
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -47,6 +53,7 @@ class Recorder:
             self.folder = _new_folder(Path(record_dir))
             manifest = {"format": FORMAT, "version": VERSION, "started": time.time(), "metadata": metadata}
             write_whole(self.folder / "manifest.json", json.dumps(manifest, indent=1, default=_plain), ConfigError)
+            self._trimmed = None if limit is None else Trimmed(Path(record_dir), limit)
         except OSError as error:
             raise ConfigError(f"can't record into {record_dir}: {error}") from error
         self._thread = threading.Thread(target=self._write_all, name="turbopi-recorder", daemon=True)
@@ -83,6 +90,8 @@ class Recorder:
         self._thread.join(max(deadline - time.monotonic(), 0.0))
         if self._thread.is_alive():
             logger.warning("the recording in %s is incomplete: the disk doesn't answer", self.folder)
+        elif self._trimmed is not None:
+            self._trimmed.report()
         logger.info("recorded %d calls in %s", self.written, self.folder)
 
     def _write_all(self) -> None:
@@ -107,11 +116,14 @@ class Recorder:
                 logger.warning("%d calls couldn't be recorded in %s: %s", self.failed, self.folder, failure)
 
     def _write(self, name: str, call: RecordedCall) -> None:
-        save_call(self.folder / name, call)
+        save_call(self.folder / name, call, self._images)
         timing = call.result.get("server_timing", {})
         line = {"file": name, "time": call.time, "infer_ms": timing.get("infer_ms")}
         self._owed.append(json.dumps(line))
         self._write_index()
+        if self._trimmed is not None:
+            for _ in range(self._trimmed.add(self.folder / name)):
+                self._count("removed")
 
     def _write_index(self) -> None:
         """Add the lines that are owed. What the disk doesn't take now is tried again with the next call."""

@@ -149,6 +149,20 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self.bad_in_a_row = self.bad_in_a_row + 1 if how == "bad" else 0
         self._feed()
 
+    async def keepalive(self) -> None:
+        """The library's, which cuts whoever doesn't answer a ping in time, but for clients that are held back here:
+        their pong may stand behind requests that wait for their turn, and aren't read yet.
+        """
+        assert self.ping_interval is not None
+        while True:
+            await asyncio.sleep(self.ping_interval)
+            pong = asyncio.ensure_future(await self.ping())
+            while self.ping_timeout is not None and not pong.done():
+                await asyncio.wait([pong], timeout=self.ping_timeout)
+                if not (pong.done() or self._unanswered or self._backlog):
+                    async with self.send_context():
+                        self.protocol.fail(CloseCode.INTERNAL_ERROR, "keepalive ping timeout")
+
     # --- what asyncio calls -------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import Any
 
+import psutil
 from rich.console import Console
 from rich.markup import escape
 
@@ -42,10 +44,13 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
     def ready(server: PolicyServer) -> None:
         if warms_up:
             print_line(f"warm-up: {time.perf_counter() - began:.1f} s")
-        http = escape(server.url.replace("ws://", "http://"))
-        print_line(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
+        first, *others = [f"ws://{name}:{server.port}" for name in addresses(server.host)] or [server.url]
+        http = escape(first.replace("ws://", "http://"))
+        print_line(f"Serving at [bold]{escape(first)}[/]   health {http}/healthz   metrics {http}/metrics")
         if server.options.has_page:
             print_line(f"Page {http}/")
+        if others:
+            print_line(f"Also at {escape(', '.join(others))}")
         if server.joins is not None:
             print_line(escape(server.joins))
         if server.recording is not None:
@@ -57,6 +62,21 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
 
     server.serve_forever(ready, stopping)
     print_line("Stopped.")
+
+
+def addresses(host: str) -> list[str]:
+    """This machine's addresses, for a server that listens on all of them, loopback last; [] for another host."""
+    if host not in ("0.0.0.0", "::", ""):
+        return []
+    families = (socket.AF_INET,) if host == "0.0.0.0" else (socket.AF_INET, socket.AF_INET6)
+    states = psutil.net_if_stats()
+    found = [
+        f"[{one.address}]" if one.family is socket.AF_INET6 else one.address
+        for name, ones in psutil.net_if_addrs().items()
+        for one in ones
+        if one.family in families and (name not in states or states[name].isup)
+    ]
+    return [*(name for name in found if not name.startswith(("127.", "[::1]", "[fe80:"))), "localhost"]
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ ERROR_KINDS = (
 )
 REFUSALS = ("busy", "late", "replaced")  # of the scheduler
 DROPPED_SESSIONS = ("closed", "idle", "full")
-RECORD_OUTCOMES = ("written", "dropped", "failed")
+RECORD_OUTCOMES = ("written", "dropped", "failed", "removed")
 
 # Seconds. A policy takes 10 ms to 1 s; a control loop cares about every 5 ms of it.
 BUCKETS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)

@@ -12,6 +12,7 @@ from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
     from turbopi.realtime.running_chunk import JoinMode
+    from turbopi.recordings.format import RecordImages
 
 MAX_BATCH = 64
 MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever
@@ -31,6 +32,8 @@ class ServerOptions:
                     warm-up can measure them in seconds; 1: never
     deadline_ms     from a request's arrival to its answer, for requests that don't say their own: for the order alone
     record_dir      if given, every observation and its actions are written below this folder
+    record_limit    "20GB", "7d" or "20GB,7d": the oldest calls below it are removed. None: everything stays
+    record_images   how images are written there: "exact", "png" (exact, too) or "jpeg"
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
     max_clients     connected at once; more are refused with HTTP 503
     page            the server's own page and its feed. None: on if only this machine or who has the key can see it
@@ -50,6 +53,8 @@ class ServerOptions:
     max_batch: int | None = None
     deadline_ms: float = 1000.0
     record_dir: str | Path | None = None
+    record_limit: str | None = None
+    record_images: "RecordImages" = "exact"
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
     page: bool | None = None
@@ -84,8 +89,21 @@ class ServerOptions:
             raise ConfigError(f"execution_horizon={self.execution_horizon} should be 1 or more")
         if self.delay_steps is not None and self.delay_steps < 0:
             raise ConfigError(f"delay_steps={self.delay_steps} should be 0 or more")
+        if self.record_dir is None and (self.record_limit is not None or self.record_images != "exact"):
+            raise ConfigError("record_limit= and record_images= are of a recording: give record_dir=, too")
+        if self.record_dir is not None:
+            self._check_recording()
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
+
+    def _check_recording(self) -> None:
+        from turbopi.recordings.format import RECORD_IMAGES
+        from turbopi.recordings.limit import RecordLimit
+
+        if self.record_limit is not None:
+            RecordLimit.of(self.record_limit)
+        if self.record_images not in RECORD_IMAGES:
+            raise ConfigError(f"record_images={self.record_images!r} should be one of {', '.join(RECORD_IMAGES)}")
 
     @property
     def has_page(self) -> bool:

@@ -32,6 +32,7 @@ from websockets.frames import CloseCode
 
 from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import Recorder
+from turbopi.recordings.limit import RecordLimit
 from turbopi.serve.calls import Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
@@ -156,7 +157,14 @@ class PolicyServer:
             metadata = {**self._policy.metadata, **self._real_time.metadata}
             self._greeting = pack(metadata)
             if self._record_dir is not None:
-                self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
+                keeps = self.options.record_limit
+                self._recorder = Recorder(
+                    self._record_dir,
+                    metadata,
+                    count=self.metrics.recorded,
+                    limit=None if keeps is None else RecordLimit.of(keeps),
+                    images=self.options.record_images,
+                )
             if self._live is not None:
                 self._live.start(metadata, self.options.queue_limit)
             try:

@@ -24,7 +24,7 @@ from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.calibrate.statistics import Method
-from turbopi.config import Kind
+from turbopi.config import PiKind
 from turbopi.engine.emulate import NO_SIGNAL, has_signal
 from turbopi.models.observation import ModelInputs
 from turbopi.models.pi0.reference import Pi0Model
@@ -96,7 +96,7 @@ def check_folder(
                 checkpoint = folder.checkpoint(case.kind)
                 loaded[case.kind, precision] = backends.create(
                     backend,
-                    checkpoint.config.model,
+                    checkpoint.config.planned_model,
                     lambda to, mode, checkpoint=checkpoint: checkpoint.load(to, mode).state,  # type: ignore[misc]
                     device=device,
                     precision=precision,
@@ -121,11 +121,11 @@ def golden_calls(case: Case) -> list[NoisyExample]:
 
 
 def golden_calibration(
-    folder: GoldenFolder, kind: Kind, device: torch.device, target: float = FP8_TARGET, format: Format = FP8
+    folder: GoldenFolder, kind: PiKind, device: torch.device, target: float = FP8_TARGET, format: Format = FP8
 ) -> Quantization:
     """A calibration on the golden cases of a kind that have the first's horizon; what it reports is on them, too."""
     checkpoint = folder.checkpoint(kind)
-    model = Pi0Model.from_state(checkpoint.config.model, checkpoint.load(device, "f32").state)
+    model = Pi0Model.from_state(checkpoint.config.planned_model, checkpoint.load(device, "f32").state)
     calls = [call for case in folder.cases() if case.kind == kind for call in golden_calls(case)]
     calls = [call for call in calls if call.noise.shape == calls[0].noise.shape]
     twice = sorted(calls * 2, key=lambda call: call.example.source)  # one gives directions, the other chooses sites

@@ -13,12 +13,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
 
 from turbopi.checkpoint import Checkpoint, open_checkpoint
-from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, Normalization, PolicyConfig, VisionConfig
+from turbopi.config import CAMERAS, GemmaConfig, ModelConfig, Normalization, PiKind, PolicyConfig, VisionConfig
 from turbopi.models import FAMILIES
 from turbopi.models.observation import Observation
 from turbopi.support.errors import CheckpointError, ObservationError
@@ -39,7 +40,7 @@ class Run:
 @dataclass(frozen=True)
 class Case:
     name: str
-    kind: Kind
+    kind: PiKind
     observation: Observation
     noise: torch.Tensor  # float32[B, H, action_dim]
     runs: list[Run]
@@ -58,7 +59,7 @@ class GoldenFolder:
     def sizes(self) -> dict[str, object]:
         return read_json(self.path / "checkpoints/model.json")
 
-    def model_config(self, kind: Kind) -> ModelConfig:
+    def model_config(self, kind: PiKind) -> ModelConfig:
         """The tiny model's sizes, from model.json."""
         sizes = self.sizes
         limits = sizes["max_token_len"]
@@ -75,7 +76,7 @@ class GoldenFolder:
             rope_base=float(sizes["rope_base"]),  # type: ignore[arg-type]
         )
 
-    def checkpoint(self, kind: Kind) -> Checkpoint:
+    def checkpoint(self, kind: PiKind) -> Checkpoint:
         """openpi's PyTorch checkpoint of that kind, or its JAX one where the folder has no other."""
         folder = self.path / "checkpoints" / kind
         for layout, mark in (("torch", "model.safetensors"), ("jax", "params")):
@@ -102,17 +103,17 @@ class GoldenFolder:
         kind = self._kind(folder.name, inputs, runs)
         return Case(folder.name, kind, _observation(inputs), torch.from_numpy(inputs["noise"]), runs)
 
-    def _kind(self, name: str, inputs: Arrays, runs: list[Run]) -> Kind:
+    def _kind(self, name: str, inputs: Arrays, runs: list[Run]) -> PiKind:
         """Pi0.5 or Pi0. Nothing records it, but their prompt lengths differ, and only Pi0.5 has a time condition."""
         limits = self.sizes["max_token_len"]
         assert isinstance(limits, dict)
         width = inputs["tokenized_prompt"].shape[1]
-        fits: list[Kind] = [kind for kind in FAMILIES if limits.get(kind) == width]
+        fits: list[PiKind] = [kind for kind in get_args(PiKind) if limits.get(kind) == width]
         if len(fits) == 1:
             return fits[0]
         if any("cond" in arrays for run in runs for arrays in run.variants.values()):
-            return next(kind for kind, family in FAMILIES.items() if family.modulated)
-        kinds: list[Kind] = [kind for kind in FAMILIES if (self.path / "checkpoints" / kind).exists()]
+            return next(kind for kind in get_args(PiKind) if FAMILIES[kind].modulated)
+        kinds: list[PiKind] = [kind for kind in get_args(PiKind) if (self.path / "checkpoints" / kind).exists()]
         if len(kinds) == 1:
             return kinds[0]
         raise ObservationError(

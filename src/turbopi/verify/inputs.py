@@ -27,6 +27,7 @@ class VerifyPlan:
     bound: float | None = None
     factor: float | None = None
     fingerprint: bool = True
+    calibrated: frozenset[str] = frozenset()  # SHA-256 of the inputs that the calibration was made on
 
 
 def check_observations(plan: VerifyPlan) -> None:
@@ -38,8 +39,26 @@ def check_observations(plan: VerifyPlan) -> None:
 
 
 def read_examples(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[Example]:
-    """The observations as the model gets them. Raises ObservationError naming the one that can't be used."""
-    return prepared(policy, _observations(policy, plan))
+    """The observations as the model gets them. Raises ObservationError naming the one that can't be used.
+
+    Of those at a path, the ones that the calibration wasn't made on; others only where there are too few of them.
+    """
+    if plan.observations is None or not plan.calibrated:
+        yield from prepared(policy, _observations(policy, plan))
+        return
+    files = chosen_files(plan.observations, plan.count)
+    first = set(files)
+    files += [one for one in chosen_files(plan.observations) if one not in first]
+    count, unseen, seen = len(files) if plan.count is None else plan.count, 0, []
+    for example in prepared(policy, ((name, load_observation(file)) for name, file in files)):
+        if example.sha256 in plan.calibrated:
+            seen.append(example)
+            continue
+        yield example
+        unseen += 1
+        if unseen == count:
+            return
+    yield from seen[: (0 if unseen else len(seen)) if plan.count is None else count - unseen]
 
 
 def _observations(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[tuple[str, Mapping[str, object]]]:

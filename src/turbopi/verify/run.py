@@ -9,6 +9,7 @@ import gc
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,9 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
     quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
     if arguments.get("robot") is None:
         checkpoint = shipped.with_libero_stats(checkpoint)
+    if quantization is not None:
+        made_on = quantization.report["observations"].get("calibration", {})
+        plan = replace(plan, calibrated=frozenset(made_on.values()))
     arguments |= {"backend": name, "device": device, "quantization": None}  # of reference and control
 
     reference = _Reference(checkpoint, arguments, plan, progress)
@@ -179,11 +183,10 @@ class _Reference:
     def describe(self, plan: VerifyPlan, quantization: Quantization | None) -> ObservationsDocument:
         """What it was run on, with a hash of all of the model's inputs."""
         digest, calibrated = hashlib.sha256(), 0
-        known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
         for example in self.examples:
             inputs = example.bytes()
             digest.update(inputs)
-            calibrated += hashlib.sha256(inputs).hexdigest() in known.values()
+            calibrated += hashlib.sha256(inputs).hexdigest() in plan.calibrated
         return ObservationsDocument(
             calibrated_on=None if quantization is None else calibrated,
             path=None if plan.observations is None else str(plan.observations),

@@ -13,7 +13,7 @@ from lerobot_policy_turbopi.real_time import MODES
 from lerobot_policy_turbopi.server import PROCESSORS, connect
 from turbopi.support.errors import CheckpointError, ConfigError
 
-KINDS = ("pi05", "pi0")
+KINDS = ("pi05", "pi0", "smolvla")
 SERVERS = {  # options that a server decides about, and what they are when they aren't given
     "checkpoint": None,
     "backend": "auto",
@@ -23,20 +23,23 @@ SERVERS = {  # options that a server decides about, and what they are when they 
     "warmup": True,
 }
 NO_TRAINING = (
-    "Turbo-Pi runs policies, it doesn't train them: train with --policy.type=pi05 or pi0, and run the checkpoint with "
-    "--policy.type=turbopi --policy.checkpoint=…"
+    "Turbo-Pi runs policies, it doesn't train them: train with --policy.type=pi05, pi0 or smolvla, and run the "
+    "checkpoint with --policy.type=turbopi --policy.checkpoint=…"
 )
+
+
+_OTHER_NAMES = {("smolvla", "num_inference_steps"): "num_steps"}  # of the checkpoint's config
 
 
 @PreTrainedConfig.register_subclass("turbopi")
 @dataclass
 class TurboPiConfig(PreTrainedConfig):
-    """How Turbo-Pi runs a LeRobot checkpoint of type pi05 or pi0.
+    """How Turbo-Pi runs a LeRobot checkpoint of type pi05, pi0 or smolvla.
 
     checkpoint           its folder, or its name on the Hugging Face hub (owner/name, with `pretrained_revision`)
     server               in place of a checkpoint: ws://HOST:PORT, a `turbopi serve CHECKPOINT` that computes for this
                          robot. It decides about backend, precision and steps. Its key: the variable TURBOPI_API_KEY
-    backend              a name from `turbopi backends`; "auto" takes the fastest one available
+    backend              a name from `turbopi doctor`; "auto" takes the fastest one available
     precision            "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
     quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json or
                          turbopi_int8.json in its folder
@@ -79,12 +82,12 @@ class TurboPiConfig(PreTrainedConfig):
         described = self._described() if self.server is None else self._served()
         self.chunk_size: int = described.chunk_size
         self.max_action_dim: int = described.max_action_dim
-        self.image_resolution: tuple[int, int] = tuple(described.image_resolution)
-        self.action_feature_names: list[str] | None = described.action_feature_names
+        self.image_resolution: tuple[int, int] = _resolution(described)
+        self.action_feature_names: list[str] | None = getattr(described, "action_feature_names", None)
         self.rtc_training_max_delay: int = getattr(described, "rtc_training_max_delay", 0)
         for name in ("input_features", "output_features", "num_inference_steps", "n_action_steps"):
             if getattr(self, name) in (None, {}):
-                setattr(self, name, getattr(described, name))
+                setattr(self, name, getattr(described, _OTHER_NAMES.get((described.type, name), name)))
         if not self.pretrained_path:  # where LeRobot looks for the processors
             self.pretrained_path: Path | None = Path(self.checkpoint) if self.checkpoint else PROCESSORS
         if self.n_action_steps is None or not 1 <= self.n_action_steps <= self.chunk_size:
@@ -94,7 +97,7 @@ class TurboPiConfig(PreTrainedConfig):
 
     def _described(self) -> Any:
         """The checkpoint's own config."""
-        import lerobot.policies  # noqa: F401 - registers pi05 and pi0
+        import lerobot.policies  # noqa: F401 - registers pi05, pi0 and smolvla
 
         try:
             described = PreTrainedConfig.from_pretrained(self.checkpoint, revision=self.pretrained_revision)
@@ -105,7 +108,8 @@ class TurboPiConfig(PreTrainedConfig):
             ) from error
         if described.type not in KINDS:
             raise CheckpointError(
-                f"{self.checkpoint} is a LeRobot checkpoint of type {described.type!r}; Turbo-Pi runs 'pi05' and 'pi0'"
+                f"{self.checkpoint} is a LeRobot checkpoint of type {described.type!r}; Turbo-Pi runs "
+                f"{', '.join(map(repr, KINDS))}"
             )
         described.validate_features()  # adds the empty cameras, and features that the file leaves to defaults
         return described
@@ -123,6 +127,7 @@ class TurboPiConfig(PreTrainedConfig):
         images = {key: PolicyFeature(type=FeatureType.VISUAL, shape=(3, 224, 224)) for key in metadata["robot_cameras"]}
         state = PolicyFeature(type=FeatureType.STATE, shape=(metadata["robot_state_dim"],))
         return SimpleNamespace(
+            type="turbopi",
             chunk_size=metadata["action_horizon"],
             max_action_dim=metadata["robot_action_dim"],
             image_resolution=(224, 224),
@@ -156,3 +161,11 @@ class TurboPiConfig(PreTrainedConfig):
 
     def validate_features(self) -> None:
         """The checkpoint's features are valid already."""
+
+
+def _resolution(described: Any) -> tuple[int, int]:
+    """(height, width) that the images of a checkpoint are resized to."""
+    if described.type == "smolvla":
+        width, height = described.resize_imgs_with_padding
+        return height, width
+    return tuple(described.image_resolution)

@@ -27,7 +27,7 @@ from turbopi import UnifiedPolicy, open_checkpoint
 from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.policy.call_options import checked_steps
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.images import fit_unit
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 from turbopi.support.reading import file_inside, read_json
 
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 
 class TurboPiPolicy(PreTrainedPolicy):
-    """A LeRobot checkpoint of type pi05 or pi0 on Turbo-Pi's fastest backend. It has no parameters of PyTorch.
+    """A LeRobot checkpoint of type pi05, pi0 or smolvla on Turbo-Pi's fastest backend. It has no parameters of PyTorch.
 
     turbopi   the policy that runs the model; None: made from `config`. Its robot, statistics and tokenizer aren't used
 
@@ -66,7 +66,7 @@ class TurboPiPolicy(PreTrainedPolicy):
         revision: str | None = None,
         **unused: Any,
     ) -> "TurboPiPolicy":
-        """A policy from a checkpoint of type pi05 or pi0, or from what `save_pretrained` left, with its options."""
+        """A policy from a checkpoint that Turbo-Pi runs, or from what `save_pretrained` left, with its options."""
         if config is None:
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, revision=revision)
         if not isinstance(config, TurboPiConfig):
@@ -228,31 +228,42 @@ class TurboPiPolicy(PreTrainedPolicy):
         )
 
     def _images(self, batch: dict[str, Tensor]) -> Tensor:
-        """float32[B, C, 224, 224, 3] in [-1, 1] of the cameras that the batch has, in the checkpoint's order."""
+        """float32[B, C, height, width, 3] in [-1, 1] of the cameras that the batch has, in the checkpoint's order."""
         present = [key for key in self.config.image_features if key in batch]
         if not present:
             wanted = ", ".join(self.config.image_features)
             raise ObservationError(
                 f"the batch has none of the checkpoint's cameras, {wanted}; it has {', '.join(batch)}"
             )
-        size = self.config.image_resolution
+        size, resize = self.config.image_resolution, self._local.config.image_resize
         camera_images = []
         for key in present:
             camera_image = batch[key].to(torch.float32)
             if camera_image.shape[1] == 3:
                 camera_image = camera_image.permute(0, 2, 3, 1)
-            camera_images.append(
-                camera_image if camera_image.shape[1:3] == size else resize_with_pad_torch(camera_image, *size)
-            )
-        return torch.stack(camera_images, dim=1).mul_(2).sub_(1)
+            if camera_image.shape[1:3] == size:
+                camera_images.append(camera_image * 2 - 1)
+            elif resize == "lerobot":
+                camera_images.append(resize_with_pad_torch(camera_image, *size) * 2 - 1)
+            else:
+                camera_images.append(fit_unit(camera_image, size, resize))
+        return torch.stack(camera_images, dim=1)
 
     def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
-        """float32[B, max_action_dim]: Pi0's, padded. Pi0.5 has it in the prompt."""
-        state = torch.zeros(rows, self.config.max_action_dim)
-        if family_of(self._local.config.model).state_token:
+        """float32[B, state_dim], padded, of a family that reads it as numbers. Pi0.5 has it in the prompt."""
+        model = self._local.config.model
+        state = torch.zeros(rows, model.state_dim)
+        if family_of(model).reads_state:
             given = batch[OBS_STATE]
             state[:, : given.shape[-1]] = given
         return state
+
+
+class _Words:
+    """A tokenizer of no model: one id for each word."""
+
+    def encode(self, text: str, *, add_bos: bool) -> list[int]:
+        return list(range(1, 1 + len(text.split())))
 
 
 def load(config: TurboPiConfig) -> UnifiedPolicy:
@@ -262,8 +273,9 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
             "no checkpoint: --policy.type=turbopi needs --policy.checkpoint=FOLDER, or a hub's owner/name"
         )
     checkpoint = open_checkpoint(local_folder(config))
-    # the edges are those of the LeRobot that runs, whichever wrote the checkpoint, and so is its time grid
-    ours = replace(checkpoint.config, image_resize="lerobot").with_model(time_grid="multiplied")
+    ours = checkpoint.config
+    if family_of(ours.model).planned:  # the edges are those of the LeRobot that runs, and so is its time grid
+        ours = replace(ours, image_resize="lerobot").with_model(time_grid="multiplied")
     policy = UnifiedPolicy(
         replace(checkpoint, config=ours, named_tokenizer=None),
         backend=config.backend,
@@ -271,7 +283,7 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         quantization=config.quantization,
         num_denoising_steps=config.num_inference_steps,
         device=config.device or "auto",
-        tokenizer=TINY_TOKENIZER,  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
+        tokenizer=_Words(),  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
     )
     described = policy.metadata
     logger.info(

@@ -1,12 +1,10 @@
-"""The suffix: noise to actions in N Euler steps of the action expert.
+"""The suffix: times, and one evaluation of the action expert. The loop around it: integrate.py.
 
 t = 1 is noise and t = 0 the action, the opposite of the Pi0 paper. x_t, v_t and the update stay float32 in every
 precision.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -31,14 +29,16 @@ def time_grid(num_steps: int, kind: str = "accumulated") -> np.ndarray:
     return np.cumsum(np.concatenate(([np.float32(1)], np.full(num_steps - 1, dt))), dtype=np.float32)
 
 
-def time_embedding(times: np.ndarray, width: int) -> Tensor:
-    """float32[N, width]: sines, then cosines, of 2πt over periods from 4e-3 to 4.
+def time_embedding(
+    times: np.ndarray, width: int, min_period: float = MIN_PERIOD, max_period: float = MAX_PERIOD
+) -> Tensor:
+    """float32[N, width]: sines, then cosines, of 2πt over periods from 4e-3 to 4, unless others are given.
 
     In float64, as in openpi's PyTorch: the fastest phases lose 1.6e-4 in float32.
     """
     t = torch.from_numpy(times.astype(np.float64))
     fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64)
-    period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** fraction
+    period = min_period * (max_period / min_period) ** fraction
     angle = t[:, None] * (2 * math.pi / period)
     return torch.cat((angle.sin(), angle.cos()), dim=-1).float()
 
@@ -51,41 +51,6 @@ def euler_step(x_t: Tensor, v_t: Tensor, num_steps: int) -> Tensor:
 def step_size(num_steps: int) -> float:
     """dt of N equal steps from 1 to 0, as float32 has it: negative."""
     return float(np.float32(-1.0 / num_steps))
-
-
-@dataclass(frozen=True)
-class Pull:
-    """Guidance of one denoising step (`conditioning.Guidance`), as tensors that broadcast to x_t [B, H, A]."""
-
-    target: Tensor  # float32[H, A]
-    weights: Tensor  # float32[H, 1]
-    strength: Tensor  # float32[H, 1]
-    times: Tensor  # float32[H, 1]
-    through_expert: bool  # the true Jacobian; False: the identity in its place
-
-    def error(self, x_t: Tensor, v_t: Tensor) -> Tensor:
-        """(target − x̂) ⊙ weights, x̂ = x − t v."""
-        return (self.target - (x_t - self.times * v_t)) * self.weights
-
-
-def guided_velocity(
-    velocity: Callable[[Tensor], tuple[Tensor, Tensor]], x_t: Tensor, pull: Pull
-) -> tuple[Tensor, Tensor]:
-    """`velocity`(x_t), which is (the expert's output, v_t), with v_t pulled: v − strength ⊙ Jᵀ error.
-
-    J = ∂x̂/∂x = 1 − t ∂v/∂x, so Jᵀ error = error − (∂v/∂x)ᵀ (t error): one backward pass through `velocity`.
-    """
-    if not pull.through_expert:
-        out, v_t = velocity(x_t)
-        return out, v_t - pull.strength * pull.error(x_t, v_t)
-    # in this thread: PyTorch's own for backward passes has no CUDA context at first, and warns of it
-    with torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
-        x = x_t.detach().requires_grad_()
-        out, v = velocity(x)
-        v_t = v.detach()
-        error = pull.error(x_t, v_t)
-        (through,) = torch.autograd.grad(v, x, pull.times * error)
-    return out.detach(), v_t - pull.strength * (error - through)
 
 
 def suffix_mask(cache: KVCache, suffix_len: int, has_state_token: bool) -> Tensor | None:

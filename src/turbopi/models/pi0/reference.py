@@ -4,35 +4,33 @@
     denoise(cache, noise, N) -> actions the action expert, N times
     sample(observation, noise, N)       both
 
-`conditioning` adds what real-time execution needs (conditioning.py). Actions after every single step, for whoever
-streams them, are the trace's x_t: x_t[k] is x after k steps.
+`conditioning` adds what real-time execution needs (conditioning.py). Actions after every single step, for a caller
+that streams them, are the trace's x_t: x_t[k] is x after k steps.
 
 Intermediates go into a `trace` dict under the names, and in the layouts, that golden files use; see `Trace`.
 Precisions: float32 (the oracle), and bfloat16 as openpi serves it, except that RoPE stays float32 (as in openpi's JAX).
 """
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from turbopi.config import FloatPrecision as FloatPrecision
 from turbopi.config import ModelConfig
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditioning, Conditionings, of_rows
-from turbopi.models.pi0.denoise import Pull, guided_velocity, run_expert, suffix_mask, suffix_rope, time_embedding
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings
+from turbopi.models.pi0.denoise import run_expert, suffix_mask, suffix_rope, time_embedding
 from turbopi.models.pi0.exact import exact_float32
 from turbopi.models.pi0.gemma import Gemma
+from turbopi.models.pi0.integrate import integrate, integrate_rows
 from turbopi.models.pi0.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
 from turbopi.models.pi0.layers import rope_tables
 from turbopi.models.pi0.prefix import camera_slots, embed_images, embed_prompt, prefix_keys_values
 from turbopi.models.pi0.vision import VisionTower
 from turbopi.support.errors import ObservationError
-
-FloatPrecision = Literal["bf16", "f32"]
 
 # Names of what a trace records. N steps, B batch, S padded prefix slots, C cameras, H horizon, L layers.
 #   prefix_embs [B, S, D]   prefix_pad_mask bool[B, S]   prefix_positions int[B, S]   vision_last_hidden [C, B, 256, W]
@@ -141,93 +139,44 @@ class Pi0Model(nn.Module):
         Raises ObservationError for a conditioning that doesn't fit.
         """
         if isinstance(conditioning, Sequence):
-            return self._denoise_rows(cache, noise, num_steps, conditioning, trace)
+
+            def one_row(row: int, one: Conditioning, its: Trace) -> Tensor:
+                return self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=its)
+
+            return integrate_rows(one_row, conditioning, noise.shape[0], trace)
         config, horizon = self.config, noise.shape[1]
-        requested = conditioning or Conditioning()
-        requested.check(num_steps, horizon, config.action_dim)
-        tokens, guidance = requested.token_times(num_steps, horizon, config.time_grid), requested.guidance
-        distinct = tokens.distinct()
-        rows = tokens.rows(distinct)
-        time_embs = time_embedding(distinct, config.expert.width).to(noise.device)  # [U, D]
-        conds = self.time_condition(time_embs) if config.kind == "pi05" else time_embs
         suffix_len = horizon + (config.kind == "pi0")  # Pi0's state token comes first
         rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
         mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
-
-        def on_device(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array).to(noise.device)
-
-        solver = None if requested.integration is None or requested.integration.is_euler else requested.integration
-        x_t, steps = noise, []
-        if requested.held is not None and requested.values is not None:
-            x_t = torch.where(on_device(requested.held)[:, None], on_device(requested.values), noise)
-        by_row = on_device(rows)
-        times, dt = on_device(tokens.times)[..., None], on_device(tokens.steps)[..., None]  # [N, H, 1]
         hidden: list[Tensor] = []
-        for i in range(num_steps):
-            one_time = bool((rows[i] == rows[i, 0]).all())
-            time = conds[rows[i, 0]][None] if one_time else conds[by_row[i]][None]  # [1, D] or [1, H, D]
-            record = hidden if trace is not None and i == 0 else None
 
-            def velocity(x: Tensor, time: Tensor = time, record: list[Tensor] | None = record) -> tuple[Tensor, Tensor]:
-                return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
+        def embed_times(times: np.ndarray) -> Tensor:
+            embedded = time_embedding(times, config.expert.width).to(noise.device)  # [U, D]
+            return self.time_condition(embedded) if config.kind == "pi05" else embedded
 
-            if guidance is None:
-                suffix_out, v_t = velocity(x_t)
-            else:
-                pull = Pull(
-                    on_device(guidance.target),
-                    on_device(guidance.weights)[:, None],
-                    on_device(guidance.strength[i])[:, None],
-                    times[i],
-                    guidance.mode == "jacobian",
-                )
-                suffix_out, v_t = guided_velocity(velocity, x_t, pull)
-            if trace is not None or solver is not None:
-                steps.append((x_t, suffix_out, v_t))
-            if solver is None:
-                x_t = x_t + dt[i] * v_t
-            else:
-                x_t = solver.next_x(i, [x for x, _, _ in steps], [v for _, _, v in steps])
+        def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+            record = hidden if trace is not None and first else None
+            return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
 
+        done = integrate(
+            velocity, embed_times, noise, num_steps, conditioning, grid=config.time_grid, keep=trace is not None
+        )
         if trace is not None:
-            batch = noise.shape[0]
+            batch, by_row = noise.shape[0], done.rows
             if conditioning is None:
-                trace["times"] = times[:, 0, 0].cpu()
+                trace["times"] = done.times[:, 0, 0].cpu()
             else:
-                trace["times"] = times[:, None, :, 0].expand(-1, batch, -1).cpu()
+                trace["times"] = done.times[:, None, :, 0].expand(-1, batch, -1).cpu()
             if config.kind == "pi05":
-                cond = conds[by_row[:, 0]][:, None] if conditioning is None else conds[by_row][:, None]
+                cond = done.conds[by_row[:, 0]][:, None] if conditioning is None else done.conds[by_row][:, None]
                 trace["cond"] = cond.expand(-1, batch, *cond.shape[2:])
-            trace["x_t"] = torch.stack([x for x, _, _ in steps] + [x_t])
-            trace["suffix_out"] = torch.stack([out for _, out, _ in steps])
-            trace["v_t"] = torch.stack([v for _, _, v in steps])
+            trace["x_t"] = torch.stack([x for x, _, _ in done.evaluations] + [done.actions])
+            trace["suffix_out"] = torch.stack([out for _, out, _ in done.evaluations])
+            trace["v_t"] = torch.stack([v for _, _, v in done.evaluations])
             if hidden:
                 trace["expert_hidden_step0"] = torch.stack([layer.detach() for layer in hidden])
-            trace["actions"] = x_t
-        return x_t
-
-    def _denoise_rows(
-        self,
-        cache: KVCache,
-        noise: Tensor,
-        num_steps: int,
-        conditioning: Sequence[Conditioning | None],
-        trace: Trace | None,
-    ) -> Tensor:
-        """Each row of a batch with a conditioning of its own."""
-        traces: list[Trace] = []
-        for row, requested in enumerate(of_rows(conditioning, noise.shape[0])):
-            traces.append({})
-            one = Conditioning() if requested is None else requested  # so that all rows' traces have the same shapes
-            self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=traces[-1])
-        joined = {
-            name: torch.cat([one[name] for one in traces], dim=int(name != "actions"))
-            for name in (traces[0] if trace is not None else ["actions"])
-        }
-        if trace is not None:
-            trace.update(joined)
-        return joined["actions"]
+            trace["actions"] = done.actions
+        return done.actions
 
     # -- their parts: each one is a stage that a backend may time, compile or replace ----------------------------------
 
@@ -331,10 +280,3 @@ def parameter_dtype(name: str, precision: FloatPrecision) -> torch.dtype:
         ".input_layernorm." in name or ".post_attention_layernorm." in name
     )
     return torch.float32 if is_gemma_norm or name.startswith(_FLOAT32_ALWAYS) else torch.bfloat16
-
-
-def parameter_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """Canonical name -> shape of every parameter of a model."""
-    with torch.device("meta"):
-        model = Pi0Model(dataclasses.replace(config))
-    return {name: tuple(parameter.shape) for name, parameter in model.state_dict().items()}

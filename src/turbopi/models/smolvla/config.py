@@ -6,9 +6,9 @@ give all of them but the numbers of heads, the norms' eps and the scale factor.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from turbopi.config import VisionConfig
+from turbopi.config import Kind, TimeRounding, VisionConfig
 
 ElementType = Literal["float32", "bfloat16"]
 
@@ -45,6 +45,7 @@ class SmolVLAConfig:
     """One network.
 
     expert_depth      layers of the action expert; it has one beside every `depth / expert_depth`-th text layer
+    image_size        of an image's side, in pixels; the position table may be for another one
     self_every        every so many-th layer's expert attends to prefix and suffix, the others across to the prefix
                       alone; 0: all across. None: attention_mode isn't "cross_attn", all attend to both
     image_start, end  ids of tokens around each image, with `add_image_special_tokens`
@@ -58,16 +59,24 @@ class SmolVLAConfig:
     expert_depth: int = 16
     self_every: int | None = 2
     scale_factor: int = 4
+    image_size: int = 512
+    max_prompt_tokens: int = 48
     action_horizon: int = 50
     action_dim: int = 32
     state_dim: int = 32
-    num_steps: int = 10
     min_period: float = 0.004
     max_period: float = 4.0
     image_start: tuple[int, ...] = ()
     image_end: tuple[int, ...] = ()
     min_prefix: int = -1
     element_types: ElementTypes = ElementTypes()
+
+    kind: ClassVar[Kind] = "smolvla"
+    time_grid: ClassVar[TimeRounding] = "multiplied"
+
+    @property
+    def vocab_size(self) -> int:
+        return self.text.vocab_size
 
     @property
     def expert_every(self) -> int:
@@ -86,6 +95,32 @@ class SmolVLAConfig:
 def expert_mlp_dim(width: int) -> int:
     """SmolLM2's rule: two thirds of four widths, up to a multiple of 256."""
     return 256 * ((int(2 * width * 4 / 3) + 255) // 256)
+
+
+# of its config.json, for checkpoints on machines without it; the sizes are those of the classes above
+PUBLISHED: Mapping[str, Mapping[str, Any]] = {
+    "HuggingFaceTB/SmolVLM2-500M-Video-Instruct": {
+        "scale_factor": 4,
+        "text_config": {
+            "hidden_size": 960,
+            "intermediate_size": 2560,
+            "num_attention_heads": 15,
+            "num_key_value_heads": 5,
+            "head_dim": 64,
+            "rms_norm_eps": 1e-5,
+            "vocab_size": 49_280,
+            "torch_dtype": "bfloat16",
+        },
+        "vision_config": {
+            "hidden_size": 768,
+            "intermediate_size": 3072,
+            "num_hidden_layers": 12,
+            "num_attention_heads": 12,
+            "image_size": 512,
+            "patch_size": 16,
+        },
+    }
+}
 
 
 def from_lerobot(config: Mapping[str, Any], vlm: Mapping[str, Any]) -> SmolVLAConfig:
@@ -127,10 +162,11 @@ def from_lerobot(config: Mapping[str, Any], vlm: Mapping[str, Any]) -> SmolVLACo
         expert_depth=expert_depth if expert_depth > 0 else depth,
         self_every=max(config.get("self_attn_every_n_layers", 2), 0) if cross else None,
         scale_factor=vlm.get("scale_factor", 4),
+        image_size=(config.get("resize_imgs_with_padding", [512, 512]) or [vision["image_size"]])[0],
+        max_prompt_tokens=config.get("tokenizer_max_length", 48),
         action_horizon=config.get("chunk_size", 50),
         action_dim=config.get("max_action_dim", 32),
         state_dim=config.get("max_state_dim", 32),
-        num_steps=config.get("num_steps", 10),
         min_period=config.get("min_period", 0.004),
         max_period=config.get("max_period", 4.0),
         min_prefix=config.get("prefix_length", -1),

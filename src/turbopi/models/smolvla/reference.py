@@ -1,8 +1,8 @@
 """The reference: SmolVLA in plain PyTorch, exact to LeRobot. Every backend is judged against it.
 
-    prefix(inputs) -> PrefixCache              SigLIP, connector and the text layers, once an observation
-    denoise(cache, noise, N) -> actions        the action expert, N times
-    sample(inputs, noise, N)                   both
+    prefix(observation) -> KVCache      SigLIP, connector and the text layers, once an observation
+    denoise(cache, noise, N) -> actions the action expert, N times
+    sample(observation, noise, N)       both
 
 What differs from Pi0: each layer of the expert is a self layer (prefix and suffix, causal among the actions) or a
 cross layer (the prefix alone, through matrices of its own); the state is the prefix's last token; RoPE's base is
@@ -14,50 +14,44 @@ result, so after the first output projection the stream has the weights' dtype, 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings
+from turbopi.models.pi0.denoise import time_embedding
 from turbopi.models.pi0.exact import exact_float32
+from turbopi.models.pi0.integrate import integrate, integrate_rows
+from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.layers import apply_rope, merge_heads, rms_normalize, rope_tables, split_heads
-from turbopi.models.pi0.vision import EncoderLayer
+from turbopi.models.pi0.vision import VisionTower, normalize_images
 from turbopi.models.smolvla.config import ROPE_BASE, SmolVLAConfig
 from turbopi.support.errors import ObservationError
 
 # Names of what a trace records, rows of one batch: image_embeddings [C * B, T, D], prefix [B, S, D], prefix_pad_mask,
-# prefix_att_mask bool[B, S], positions int[B, S], keys_i, values_i [B, S, G, K], suffix_first, expert_out [B, A, D],
-# v_first, v_last [B, A, action_dim]
+# prefix_att_mask bool[B, S], positions int[B, S], kv_k, kv_v [L, B, S, G, K], suffix_first, expert_out [B, A, D],
+# x_t [N + 1, B, A, action_dim], v_t [N, B, A, action_dim], actions [B, A, action_dim]
 Trace = dict[str, Tensor]
+Attend = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class SmolVLAInputs:
-    """What the network takes of B observations.
+class EmbeddedPrefix:
+    """An observation as it enters the text layers.
 
-    images      float32[B, C, 3, size, size], [-1, 1]
-    image_mask  bool[B, C]
-    tokens      int64[B, T], token_mask bool[B, T]
-    state       float32[B, state_dim], normalised, zeros past the robot's width
+    embs   [B, S, D]
+    valid  bool[B, S]
+    block  bool[B, S]  where a new attention block begins: a place sees its own block and those before it
     """
 
-    images: Tensor
-    image_mask: Tensor
-    tokens: Tensor
-    token_mask: Tensor
-    state: Tensor
-
-
-@dataclass(frozen=True)
-class PrefixCache:
-    """Keys (rotated) and values [B, G, S, K] of each text layer, and which places are valid, bool[B, S]."""
-
-    keys: Sequence[Tensor]
-    values: Sequence[Tensor]
+    embs: Tensor
     valid: Tensor
+    block: Tensor
 
 
 class RMSNorm(nn.Module):
@@ -122,31 +116,69 @@ class Layer(nn.Module):
         return mlp
 
 
-class SmolVLAModel(nn.Module):
-    """Build it on the meta device and load a checkpoint's tensors into it, in `parameter_dtype`s."""
+class Vision(VisionTower):
+    """SigLIP for patch grids of any size: float32[N, h, w, 3] in [-1, 1] -> [N, patches, W], in the weights' dtype."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = self.embed_patches(normalize_images(images).to(self.patch_embedding.weight.dtype))
+        for layer in self.layers:
+            x = layer(x)
+        return self.post_layernorm(x)
+
+    def embed_patches(self, images: Tensor) -> Tensor:
+        n, p = images.shape[0], self.config.patch_size
+        rows, columns = images.shape[1] // p, images.shape[2] // p
+        patches = images.reshape(n, rows, p, columns, p, 3).permute(0, 1, 3, 5, 2, 4).flatten(3).flatten(1, 2)
+        x = F.linear(patches, self.patch_embedding.weight.flatten(1), self.patch_embedding.bias)
+        table = self.config.image_size // p
+        row = torch.arange(rows, device=x.device) * table // rows
+        column = torch.arange(columns, device=x.device) * table // columns
+        return x + self.position_embedding((row[:, None] * table + column).flatten())
+
+
+class Text(nn.Module):
+    """SmolLM2's embedding and the layers that SmolVLA uses; their keys and values are all that is kept."""
 
     layers: Sequence[Layer]
-    expert_layers: Sequence[Layer]
+
+    def __init__(self, config: SmolVLAConfig) -> None:
+        super().__init__()
+        text = config.text
+        self.embed_tokens = nn.Embedding(text.vocab_size, text.width)
+        layers = (Layer(text.width, text.mlp_dim, text.width, config) for _ in range(text.depth))
+        self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
+
+
+class Expert(nn.Module):
+    layers: Sequence[Layer]
+
+    def __init__(self, config: SmolVLAConfig) -> None:
+        super().__init__()
+        text, width = config.text, config.expert_width
+        kv_width = text.num_kv_heads * text.head_dim
+        layers = (
+            Layer(width, config.expert_mlp, width if config.is_self_layer(at) else kv_width, config)
+            for at in config.expert_at
+        )
+        self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
+        self.norm = RMSNorm(width, text.rms_norm_eps)
+
+
+class SmolVLAModel(nn.Module):
+    """Build it on the meta device and load a checkpoint's tensors into it, in `parameter_dtype`s.
+
+    attend  of text layers and expert, `attention`; a backend may take a faster one
+    """
 
     def __init__(self, config: SmolVLAConfig) -> None:
         super().__init__()
         self.config = config
-        text, vision, width = config.text, config.vision, config.expert_width
-        self.patch_embedding = nn.Conv2d(3, vision.width, vision.patch_size, vision.patch_size)
-        self.position_embedding = nn.Embedding(vision.num_tokens, vision.width)
-        self.vision_layers = nn.ModuleList(EncoderLayer(vision) for _ in range(vision.depth))
-        self.post_layernorm = nn.LayerNorm(vision.width, eps=vision.layer_norm_eps)
-        self.connector = nn.Linear(vision.width * config.scale_factor**2, text.width, bias=False)
-        self.embed_tokens = nn.Embedding(text.vocab_size, text.width)
-        layers = (Layer(text.width, text.mlp_dim, text.width, config) for _ in range(text.depth))
-        self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
-        kv_width = text.num_kv_heads * text.head_dim
-        experts = (
-            Layer(width, config.expert_mlp, width if config.is_self_layer(at) else kv_width, config)
-            for at in config.expert_at
-        )
-        self.expert_layers = nn.ModuleList(experts)  # type: ignore[assignment]
-        self.expert_norm = RMSNorm(width, text.rms_norm_eps)
+        self.attend: Attend = attention
+        text, width = config.text, config.expert_width
+        self.vision = Vision(config.vision)
+        self.projector = nn.Linear(config.vision.width * config.scale_factor**2, text.width, bias=False)
+        self.vlm = Text(config)
+        self.expert = Expert(config)
         self.state_proj = nn.Linear(config.state_dim, text.width)
         self.action_in_proj = nn.Linear(config.action_dim, width)
         self.action_out_proj = nn.Linear(width, config.action_dim)
@@ -161,212 +193,241 @@ class SmolVLAModel(nn.Module):
         model.load_state_dict(state, strict=True, assign=True)
         return model.eval().requires_grad_(False)
 
+    @property
+    def device(self) -> torch.device:
+        return self.action_in_proj.weight.device
+
     # -- the two halves ----------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     @exact_float32()
     def sample(
         self,
-        inputs: SmolVLAInputs,
+        observation: Observation,
         noise: Tensor,
-        num_steps: int | None = None,
+        num_steps: int,
         *,
-        conditioning: Conditioning | None = None,
+        compact: bool = True,
+        conditioning: Conditionings = None,
         trace: Trace | None = None,
     ) -> Tensor:
         """Actions float32[B, A, action_dim], normalised, from noise of that shape: deterministic for given noise."""
-        return self.denoise(self.prefix(inputs, trace=trace), noise, num_steps, conditioning=conditioning, trace=trace)
+        cache = self.prefix(observation, compact=compact, trace=trace)
+        return self.denoise(cache, noise, num_steps, conditioning=conditioning, trace=trace)
 
     @torch.no_grad()
     @exact_float32()
-    def prefix(self, inputs: SmolVLAInputs, *, trace: Trace | None = None) -> PrefixCache:
-        """Keys and values of images, prompt and state, through all text layers."""
-        x, valid, block = self.embed_prefix(inputs, trace)
-        order = block.long().cumsum(1)
-        sees = order[:, None, :] <= order[:, :, None]  # [B, query, key]
-        mask = (sees & valid[:, None, :] & valid[:, :, None])[:, None]
-        positions = valid.long().cumsum(1) - 1
-        rope = rope_tables(positions, self.config.text.head_dim, ROPE_BASE)
-        if trace is not None:
-            trace |= {"prefix": x, "prefix_pad_mask": valid, "prefix_att_mask": block, "positions": positions}
-        keys, values = [], []
-        for number, layer in enumerate(self.layers):
-            normed = layer.input_layernorm(x)
-            keys.append(apply_rope(layer.project(layer.self_attn.k_proj, normed), *rope))
-            values.append(layer.project(layer.self_attn.v_proj, normed))
-            if trace is not None:
-                trace[f"keys_{number}"] = keys[-1].transpose(1, 2)
-                trace[f"values_{number}"] = values[-1].transpose(1, 2)
-            if number + 1 < len(self.layers):  # the last one's actual output is read by nobody
-                q = apply_rope(layer.project(layer.self_attn.q_proj, normed), *rope)
-                x = layer.finish(x, attention(q, keys[-1], values[-1], mask))
-        return PrefixCache(keys, values, valid)
+    def prefix(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> KVCache:
+        """Keys (rotated) and values of images, prompt and state, through all text layers.
+
+        compact=True leaves out cameras and places of the prompt that no row needs; both give the same actions.
+
+        Raises ObservationError if a row has no camera.
+        """
+        return self.keys_values(self.embed(observation, compact=compact, trace=trace), trace=trace)
 
     @torch.no_grad()
     @exact_float32()
     def denoise(
         self,
-        cache: PrefixCache,
+        cache: KVCache,
         noise: Tensor,
-        num_steps: int | None = None,
+        num_steps: int,
         *,
-        conditioning: Conditioning | None = None,
+        conditioning: Conditionings = None,
         trace: Trace | None = None,
     ) -> Tensor:
-        """Euler steps from noise float32[B, A, action_dim] at t = 1 to actions at t = 0.
+        """Integrate from noise float32[B, A, action_dim] to actions of the same shape, as `Pi0Model.denoise`."""
+        if isinstance(conditioning, Sequence):
 
-        conditioning  guidance of mode "identity" alone, which is LeRobot's real-time chunking: its pull takes no
-                      gradient through the expert. Raises ObservationError for another.
-        """
-        steps = num_steps or self.config.num_steps
-        pull = _identity_pull(conditioning, steps, noise)
+            def one_row(row: int, one: Conditioning, its: Trace) -> Tensor:
+                return self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=its)
+
+            return integrate_rows(one_row, conditioning, noise.shape[0], trace)
         crossed = self.cross_keys_values(cache)
-        x, dt = noise, -1.0 / steps
-        for step in range(steps):
-            t = 1.0 + step * dt
-            record = trace if step == 0 else None
-            v = self.velocity(x, t, cache, crossed, record)
-            if trace is not None:
-                trace |= {"v_last": v} | ({"v_first": v} if step == 0 else {})
-            if pull is not None:
-                target, weights, strength = pull
-                v = v - strength[step][:, None] * weights[:, None] * (target - (x - t * v))
-            x = x + dt * v
-        return x
+
+        def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+            return self.velocity(x, time, cache, crossed, trace if first else None)
+
+        done = integrate(
+            velocity,
+            lambda times: self.embed_times(times).to(noise.device),
+            noise,
+            num_steps,
+            conditioning,
+            grid=self.config.time_grid,
+            keep=trace is not None,
+        )
+        if trace is not None:
+            trace["x_t"] = torch.stack([x for x, _, _ in done.evaluations] + [done.actions])
+            trace["v_t"] = torch.stack([v for _, _, v in done.evaluations])
+            trace["actions"] = done.actions
+        return done.actions
 
     # -- their parts --------------------------------------------------------------------------------------------------
 
-    def embed_images(self, images: Tensor) -> Tensor:
-        """float32 [N, 3, size, size], [-1, 1] -> [N, T, D]: SigLIP, pixel shuffle and connector, unscaled."""
-        config = self.config.vision
-        n, p = images.shape[0], config.patch_size
-        rows, columns = images.shape[2] // p, images.shape[3] // p
-        dtype = self.patch_embedding.weight.dtype
-        patches = images.to(dtype).reshape(n, 3, rows, p, columns, p).permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)
-        x = F.linear(patches, self.patch_embedding.weight.flatten(1), self.patch_embedding.bias)
-        table = config.image_size // p
-        row = torch.arange(rows, device=x.device) * table // rows
-        column = torch.arange(columns, device=x.device) * table // columns
-        x = x + self.position_embedding((row[:, None] * table + column).flatten())
-        for layer in self.vision_layers:
-            x = layer(x)
-        return self.connector(pixel_shuffle(self.post_layernorm(x), rows, self.config.scale_factor))
+    @torch.no_grad()
+    @exact_float32()
+    def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
+        """Images, prompt and state to the embeddings that enter the text layers (the vision tower is most of it)."""
+        embedded = self.embed_prefix(self.compacted(observation) if compact else observation, trace)
+        if trace is not None:
+            trace["prefix"], trace["prefix_pad_mask"] = embedded.embs, embedded.valid
+            trace["prefix_att_mask"] = embedded.block
+        return embedded
 
-    def embed_prefix(self, inputs: SmolVLAInputs, trace: Trace | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """(embeddings [B, S, D], valid bool[B, S], block bool[B, S]: where a new attention block begins)"""
-        batch, cameras = inputs.images.shape[:2]
+    @torch.no_grad()
+    @exact_float32()
+    def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
+        """Run the text layers over embedded places and keep every layer's keys and values."""
+        k, v, positions = self.encode_prefix(embedded)
+        if trace is not None:
+            trace |= {"positions": positions, "kv_k": k.transpose(2, 3), "kv_v": v.transpose(2, 3)}
+        return self.cache_of(embedded, k, v)
+
+    @staticmethod
+    def cache_of(embedded: EmbeddedPrefix, k: Tensor, v: Tensor) -> KVCache:
+        return KVCache(k, v, embedded.valid, embedded.valid.sum(1), embedded.embs[:, :0].float())
+
+    def encode_prefix(self, embedded: EmbeddedPrefix) -> tuple[Tensor, Tensor, Tensor]:
+        """K (rotated), V [layer, B, G, S, K], and positions int[B, S]."""
+        x, valid = embedded.embs, embedded.valid
+        order = embedded.block.long().cumsum(1)
+        sees = order[:, None, :] <= order[:, :, None]  # [B, query, key]
+        mask = (sees & valid[:, None, :] & valid[:, :, None])[:, None]
+        positions = valid.long().cumsum(1) - 1
+        rope = rope_tables(positions, self.config.text.head_dim, ROPE_BASE)
+        keys, values = [], []
+        for number, layer in enumerate(self.vlm.layers):
+            normed = layer.input_layernorm(x)
+            keys.append(apply_rope(layer.project(layer.self_attn.k_proj, normed), *rope))
+            values.append(layer.project(layer.self_attn.v_proj, normed))
+            if number + 1 < len(self.vlm.layers):  # the last one's actual output is read by nobody
+                q = apply_rope(layer.project(layer.self_attn.q_proj, normed), *rope)
+                x = layer.finish(x, self.attend(q, keys[-1], values[-1], mask))
+        return torch.stack(keys), torch.stack(values), positions
+
+    @staticmethod
+    def compacted(observation: Observation) -> Observation:
+        """Without cameras and places of the prompt that no row needs; reading the masks waits for the device.
+
+        A masked place takes no position and nothing attends to it, so leaving it out is exact.
+
+        Raises ObservationError if a row has no camera.
+        """
+        if not bool(observation.image_mask.any(1).all()):
+            raise ObservationError("SmolVLA needs an image of one camera at least, and an observation has none")
+        cameras = observation.image_mask.any(0).nonzero().squeeze(1)
+        places = observation.token_mask.any(0).nonzero().squeeze(1)
+        return Observation(
+            observation.images[:, cameras],
+            observation.image_mask[:, cameras],
+            observation.tokens[:, places],
+            observation.token_mask[:, places],
+            observation.state,
+        )
+
+    def embed_images(self, images: Tensor) -> Tensor:
+        """(uint8 | float32 in [-1, 1]) [N, h, w, 3] -> [N, T, D]: SigLIP, pixel shuffle and connector, unscaled."""
+        rows = images.shape[1] // self.config.vision.patch_size
+        return self.projector(pixel_shuffle(self.vision(images), rows, self.config.scale_factor))
+
+    def embed_prefix(
+        self, observation: Observation, trace: Trace | None = None, *, embedded: Tensor | None = None
+    ) -> EmbeddedPrefix:
+        """embedded  [C * B, T, D], camera by camera: what `embed_images` made of the images, if that is done"""
+        batch, cameras = observation.image_mask.shape
         parts: list[Tensor] = []
         valid: list[Tensor] = []
-        everywhere = inputs.token_mask.new_ones
-        for camera in range(cameras):
-            embedded = self.embed_images(inputs.images[:, camera])
-            if trace is not None:
-                before = trace.get("image_embeddings")
-                trace["image_embeddings"] = embedded if before is None else torch.cat((before, embedded))
-            scale = torch.tensor(self.config.text.width**0.5, dtype=embedded.dtype, device=embedded.device)
-            tokens = embedded.shape[1]
-            for ids, images in ((self.config.image_start, embedded * scale), (self.config.image_end, None)):
+        everywhere = observation.token_mask.new_ones
+        if embedded is None:
+            embedded = self.embed_images(observation.images.transpose(0, 1).flatten(0, 1))
+        if trace is not None:
+            trace["image_embeddings"] = embedded
+        for camera, its in enumerate(embedded.reshape(cameras, batch, *embedded.shape[1:])):
+            scale = torch.tensor(self.config.text.width**0.5, dtype=its.dtype, device=its.device)
+            for ids, images in ((self.config.image_start, its * scale), (self.config.image_end, None)):
                 if ids:
-                    special = torch.tensor(ids, device=inputs.tokens.device)
-                    parts.append(self.embed_tokens(special).expand(batch, -1, -1))
+                    special = torch.tensor(ids, device=its.device)
+                    parts.append(self.vlm.embed_tokens(special).expand(batch, -1, -1))
                     valid.append(everywhere(batch, len(ids)))
                 if images is not None:
                     parts.append(images)
-                    valid.append(inputs.image_mask[:, camera, None].expand(-1, tokens))
-        parts.append(self.embed_tokens(inputs.tokens) * math.sqrt(self.config.text.width))
-        valid.append(inputs.token_mask)
-        parts.append(self.state_proj(inputs.state)[:, None])
+                    valid.append(observation.image_mask[:, camera, None].expand(-1, images.shape[1]))
+        parts.append(self.vlm.embed_tokens(observation.tokens) * math.sqrt(self.config.text.width))
+        valid.append(observation.token_mask)
+        parts.append(self.state_proj(observation.state)[:, None])
         valid.append(everywhere(batch, 1))
         x, mask = torch.cat(parts, dim=1), torch.cat(valid, dim=1)
         block = torch.zeros_like(mask)
         block[:, -1] = True
         if (missing := self.config.min_prefix - x.shape[1]) > 0:
             x, mask, block = F.pad(x, (0, 0, 0, missing)), F.pad(mask, (0, missing)), F.pad(block, (0, missing))
-        return x, mask, block
+        return EmbeddedPrefix(x, mask, block)
 
-    def cross_keys_values(self, cache: PrefixCache) -> list[tuple[Tensor, Tensor] | None]:
+    def cross_keys_values(self, cache: KVCache) -> list[tuple[Tensor, Tensor] | None]:
         """What each layer of the expert attends to across, the same at every step; None: a self layer.
 
         Its keys are made of the cached keys, which are rotated already, and aren't rotated again.
         """
         crossed: list[tuple[Tensor, Tensor] | None] = []
-        for at, layer in zip(self.config.expert_at, self.expert_layers, strict=True):
+        for at, layer in zip(self.config.expert_at, self.expert.layers, strict=True):
             if self.config.is_self_layer(at):
                 crossed.append(None)
             else:
                 attention = layer.self_attn
-                k = layer.project(attention.k_proj, merge_heads(cache.keys[at]))
-                crossed.append((k, layer.project(attention.v_proj, merge_heads(cache.values[at]))))
+                k = layer.project(attention.k_proj, merge_heads(cache.k[at]))
+                crossed.append((k, layer.project(attention.v_proj, merge_heads(cache.v[at]))))
         return crossed
 
     def velocity(
         self,
         x_t: Tensor,
-        t: float,
-        cache: PrefixCache,
+        time: Tensor,
+        cache: KVCache,
         crossed: Sequence[tuple[Tensor, Tensor] | None],
         trace: Trace | None = None,
-    ) -> Tensor:
-        """One evaluation of the expert -> v float32[B, A, action_dim] at x_t float32[B, A, action_dim]."""
+    ) -> tuple[Tensor, Tensor]:
+        """One evaluation of the expert -> (its output float32[B, A, D], v_t float32[B, A, action_dim]).
+
+        time  float32[1, D], or [1, A, D] by action: `embed_times`
+        """
         config, horizon = self.config, x_t.shape[1]
-        x = self.embed_suffix(x_t, t)
+        x = self.embed_suffix(x_t, time)
         if trace is not None:
             trace["suffix_first"] = x
         own = torch.arange(horizon, device=x.device)[None].expand(x.shape[0], -1)  # actions count from 0 across
-        behind = own + cache.valid.sum(1, keepdim=True)
+        behind = own + cache.lengths[:, None]
         across, within = (rope_tables(positions, config.text.head_dim, ROPE_BASE) for positions in (own, behind))
         causal = own[:, None, :] <= own[:, :, None]
-        prefix_mask = cache.valid[:, None, :].expand(-1, horizon, -1)
+        assert cache.mask is not None
+        prefix_mask = cache.mask[:, None, :].expand(-1, horizon, -1)
         self_mask = torch.cat((prefix_mask, causal), dim=2)[:, None]
-        for at, layer, other in zip(config.expert_at, self.expert_layers, crossed, strict=True):
+        for at, layer, other in zip(config.expert_at, self.expert.layers, crossed, strict=True):
             normed = layer.input_layernorm(x)
             q = layer.project(layer.self_attn.q_proj, normed)
             if other is not None:
-                attended = attention(apply_rope(q, *across), *other, prefix_mask[:, None])
+                attended = self.attend(apply_rope(q, *across), *other, prefix_mask[:, None])
             else:
                 k = apply_rope(layer.project(layer.self_attn.k_proj, normed), *within)
                 v = layer.project(layer.self_attn.v_proj, normed)
-                k, v = torch.cat((cache.keys[at], k), dim=2), torch.cat((cache.values[at], v), dim=2)
-                attended = attention(apply_rope(q, *within), k, v, self_mask)
+                k, v = torch.cat((cache.k[at], k), dim=2), torch.cat((cache.v[at], v), dim=2)
+                attended = self.attend(apply_rope(q, *within), k, v, self_mask)
             x = layer.finish(x, attended)
-        out = self.expert_norm(x).float()
+        out = self.expert.norm(x).float()
         if trace is not None:
             trace["expert_out"] = out
-        return self.action_out_proj(out)
+        return out, self.action_out_proj(out)
 
-    def embed_suffix(self, x_t: Tensor, t: float) -> Tensor:
+    def embed_times(self, times: np.ndarray) -> Tensor:
+        """float32[U] -> float32[U, D]"""
+        return time_embedding(times, self.config.expert_width, self.config.min_period, self.config.max_period)
+
+    def embed_suffix(self, x_t: Tensor, time: Tensor) -> Tensor:
         """Actions mixed with the time -> float32 [B, A, D]"""
         actions = self.action_in_proj(x_t)
-        time = time_embedding(t, self.config).to(actions)
-        mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
+        mixed = torch.cat((actions, time.to(actions).expand_as(actions)), dim=-1)
         return self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
-
-
-def _identity_pull(
-    conditioning: Conditioning | None, steps: int, noise: Tensor
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Target [A, action_dim], weights [A] and strength [N, A] on the noise's device; None: a plain loop."""
-    if conditioning is None or conditioning.form == "plain":
-        return None
-    guidance = conditioning.guidance
-    plain = conditioning.tokens is None and conditioning.held is None and conditioning.integration is None
-    if guidance is None or guidance.mode != "identity" or not plain:
-        raise ObservationError(
-            'SmolVLA joins chunks by guidance of mode "identity" alone, as LeRobot does: not by held actions, times of '
-            "single actions, the guidance with a gradient, or other solvers"
-        )
-    conditioning.check(steps, noise.shape[1], noise.shape[2])
-    arrays = (guidance.target, guidance.weights, guidance.strength)
-    target, weights, strength = (torch.from_numpy(array).to(noise.device) for array in arrays)
-    return target, weights, strength
-
-
-def time_embedding(t: float, config: SmolVLAConfig) -> Tensor:
-    """[sin, cos] of 2 pi t / period, float32 [expert_width]; periods spread by powers, in float64."""
-    fraction = torch.linspace(0.0, 1.0, config.expert_width // 2, dtype=torch.float64)
-    period = config.min_period * (config.max_period / config.min_period) ** fraction
-    angle = torch.tensor(t, dtype=torch.float32).double() * (2 * math.pi / period)
-    return torch.cat((angle.sin(), angle.cos())).float()
 
 
 def pixel_shuffle(x: Tensor, side: int, factor: int) -> Tensor:

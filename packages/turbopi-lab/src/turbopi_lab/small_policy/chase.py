@@ -205,13 +205,13 @@ class Trainer:
         self.settings, self.device = settings, torch.device(settings.device)
         torch.manual_seed(settings.seed)
         if start is None:
-            self.model = fresh_model(CONFIG.model, settings.seed)
+            self.model = fresh_model(CONFIG.planned_model, settings.seed)
             _see_dots(self.model)
         else:
-            self.model = trained_model(CONFIG.model, start)
+            self.model = trained_model(CONFIG.planned_model, start)
         self.model.to(self.device)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
-        self.guide = Guide(CONFIG.model.vlm.width, GUIDED, 1, queries=3).to(self.device)
+        self.guide = Guide(CONFIG.planned_model.vlm.width, GUIDED, 1, queries=3).to(self.device)
         self._parameters = [*self.model.parameters(), *self.guide.parameters()]
         self.optimizer = torch.optim.AdamW(self._parameters, settings.learning_rate, (0.9, 0.95), weight_decay=0.01)
         self.steps = 0
@@ -254,7 +254,7 @@ class Trainer:
         held = held_actions(batch.delays.repeat_interleave(repeats, 0), HORIZON)
         noise, t = torch.randn_like(actions), draw_times(len(actions), self.device)
         tokens, mask = self.tokens.expand(rows, -1), self.mask.expand(rows, -1)
-        x, camera_images = mixed(actions, noise, t, held), batch.camera_images(CONFIG.model.vision.image_size)
+        x, camera_images = mixed(actions, noise, t, held), batch.camera_images(CONFIG.planned_model.vision.image_size)
         predicted, hidden = velocity(self.model, camera_images, tokens, mask, x, t, held=held)
         guessed, _ = self.guide(hidden, mask)
         guide = torch.nn.functional.smooth_l1_loss(guessed, batch.guided(), beta=0.1)
@@ -300,7 +300,7 @@ def watch(model: Pi0Model, delay: int, trained: bool, episodes: int = 100, every
     noises = torch.Generator().manual_seed(0)
 
     def ask(given: Tensor, d: int) -> Tensor:
-        camera_images = torch.from_numpy(world.draw(CONFIG.model.vision.image_size)).to(device)
+        camera_images = torch.from_numpy(world.draw(CONFIG.planned_model.vision.image_size)).to(device)
         noise = torch.randn(episodes, HORIZON, CONFIG.model.action_dim, generator=noises).to(device)
         return sample(model, camera_images, noise, given, d)
 
@@ -353,7 +353,7 @@ def train(settings: Settings) -> None:
 
 
 def _reported(trainer: Trainer, losses: list[tuple[float, float]], seconds: float) -> dict[str, float]:
-    model = Pi0Model(CONFIG.model).to(trainer.device)
+    model = Pi0Model(CONFIG.planned_model).to(trainer.device)
     model.load_state_dict(trainer.average)
     row = {"seconds": round(seconds), "step": trainer.steps, **_mean(losses)}
     for delay, trained in ((0, False), (4, False), (4, True)):

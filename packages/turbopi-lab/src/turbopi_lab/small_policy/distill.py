@@ -78,12 +78,12 @@ def train(settings: Settings) -> None:
     settings.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
     config = open_checkpoint(settings.start).config
-    teacher = trained_model(config.model, settings.start).requires_grad_(False)
+    teacher = trained_model(config.planned_model, settings.start).requires_grad_(False)
     started = time.monotonic()
     with torch.no_grad():
         ways = teach(teacher, settings, of_post=config.asset_id == "turbopi/post")
     print(f"{ways.noise.shape[0] * ways.noise.shape[1]} ways in {time.monotonic() - started:.0f} s", flush=True)
-    student = Student(trained_model(config.model, settings.start), settings)
+    student = Student(trained_model(config.planned_model, settings.start), settings)
     losses = []
     for step in range(settings.steps):
         losses.append(student.step(ways, step / settings.steps))

@@ -57,7 +57,7 @@ def export(
         config=config,
         config_source="training",
         norm_stats=stats,
-        source=TrainedWeights(state, config.model.vision.num_heads),
+        source=TrainedWeights(state, config.planned_model.vision.num_heads),
         asset_id=config.asset_id,
         tokenizer_candidates=(TINY_TOKENIZER,),
     )

@@ -29,7 +29,7 @@ def learner_of(folder: Path) -> Learner:
     checkpoint, device = open_checkpoint(folder), torch.device("cpu")
     assert checkpoint.norm_stats is not None and checkpoint.norm_stats.actions is not None
     scale = Normalizer("quantile", checkpoint.norm_stats.actions, "actions")
-    actor = Actor(CONFIG.model, 1, *prompt_table(), device)
+    actor = Actor(CONFIG.planned_model, 1, *prompt_table(), device)
     actor.take(checkpoint.load(device, "f32").state)
 
     def ask(camera_images: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray:

@@ -111,12 +111,12 @@ class Trainer:
         self.stats = load_norm_stats(settings.stats)
         self.scale = Normalizer("quantile", self.stats.actions, "actions")
         first = (
-            fresh_model(CONFIG.model, settings.seed)
+            fresh_model(CONFIG.planned_model, settings.seed)
             if settings.start is None
-            else trained_model(CONFIG.model, settings.start)
+            else trained_model(CONFIG.planned_model, settings.start)
         )
         self.model = first.to(self.device)
-        self.guide = Guide(CONFIG.model.vlm.width, GUIDE_VALUES, len(PHASES)).to(self.device)
+        self.guide = Guide(CONFIG.planned_model.vlm.width, GUIDE_VALUES, len(PHASES)).to(self.device)
         self.tokens, self.token_mask = (tensor.to(self.device) for tensor in prompt_table())
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.optimizer = self._make_optimizer()
@@ -273,7 +273,7 @@ def train(settings: Settings) -> None:
     before = trainer.load(out / "state.pt") if settings.resume else 0.0
     memory = Memory(settings.capacity, trainer.device)
     rows = min(32, settings.workers)
-    actor = Actor(CONFIG.model, rows, *prompt_table(), trainer.device)
+    actor = Actor(CONFIG.planned_model, rows, *prompt_table(), trainer.device)
     actor.take(trainer.average)
     tapes = _tapes(settings)
     fleet = Fleet(

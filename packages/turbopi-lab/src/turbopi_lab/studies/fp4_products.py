@@ -91,7 +91,7 @@ def _cosine(ours: Tensor, exact: Tensor) -> float:
 
 def savings() -> Grid:
     """Least time to read the weights of a call of pi05_libero, ten steps, by GPU and format. Arithmetic."""
-    config, job = preset("pi05_libero").model, Job()
+    config, job = preset("pi05_libero").planned_model, Job()
     read = {name: stage_work(config, job, 1)[name].bytes for name in ("vision", "prefix", "denoise")}
     rows: list[list[Cell]] = []
     for gpu, (bandwidth, multiplies) in GPUS.items():

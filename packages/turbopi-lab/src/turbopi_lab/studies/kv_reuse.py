@@ -273,7 +273,9 @@ def speed_ups(reuse: Reuse, reused: float, whole: float) -> tuple[float, float, 
     """Of Pi0.5 for LIBERO in full size, by arithmetic: by its operations, by the H200's times of its stages, and by
     those if comparing images were free.
     """
-    work = {name: float(stage.flops) for name, stage in stage_work(preset("pi05_libero").model, Job(), 2).items()}
+    work = {
+        name: float(stage.flops) for name, stage in stage_work(preset("pi05_libero").planned_model, Job(), 2).items()
+    }
 
     def of(cost: Mapping[str, float], total: float, free: bool = False) -> float:
         shares = saved(reuse, reused, whole, free=free)

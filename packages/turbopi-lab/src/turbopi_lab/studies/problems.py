@@ -108,7 +108,7 @@ def libero_batches(
     tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=config.model.vocab_size)
     pipeline = Pipeline(config, checkpoint.norm_stats, tokenizer)
     frames = shipped.load_frames()
-    model = Pi0Model.from_state(config.model, checkpoint.load(device, "f32").state)
+    model = Pi0Model.from_state(config.planned_model, checkpoint.load(device, "f32").state)
     shape = (config.model.action_horizon, config.model.action_dim)
 
     def batch(chosen: Sequence[shipped.Frame], seed: int) -> Batch:

@@ -60,7 +60,7 @@ class ToyPolicy:
 
     def observe(self, world: Chase) -> Observation:
         """What all episodes see now."""
-        camera_images = torch.from_numpy(world.draw(self.config.model.vision.image_size))
+        camera_images = torch.from_numpy(world.draw(self.config.planned_model.vision.image_size))
         batch, cameras = camera_images.shape[:2]
         tokens = self.tokens.expand(batch, -1)
         there = torch.ones(batch, cameras, dtype=torch.bool)
@@ -80,7 +80,7 @@ def open_policy(name: str, folder: Path = shipped.CHASE_POLICY) -> ToyPolicy:
     config = checkpoint.config
     toy = POST if config.asset_id == "turbopi/post" else CHASE
     tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=config.model.vocab_size)
-    model = Pi0Model.from_state(config.model, checkpoint.load(torch.device("cpu"), "f32").state)
+    model = Pi0Model.from_state(config.planned_model, checkpoint.load(torch.device("cpu"), "f32").state)
     return ToyPolicy(name, toy, model, config, torch.tensor([tokenizer.encode(toy.instruction)]))
 
 

@@ -1,0 +1,331 @@
+"""Backend `cuda_graph` for families that the engine has no plan for: their reference, compiled and captured.
+
+An observation is three kinds of graph for so many cameras: "vision", "prefix", for a prompt of any length, and "step",
+one evaluation of the expert. The loop around the steps is the reference's own (`integrate`), so it takes whatever that
+does but gradients. Images are resized on the device.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.backends.base import BegunBatch, LoadState, Precision, Sample, StageTimer, Trace
+from turbopi.backends.cuda_graph import CudaGraphBackend
+from turbopi.backends.pytorch import PyTorchBackend
+from turbopi.backends.pytorch_compile import PyTorchCompileBackend
+from turbopi.backends.pytorch_compile import compiled as compile_stage
+from turbopi.config import ImageResize
+from turbopi.engine.graph import Graph, building
+from turbopi.engine.plan import cold_call
+from turbopi.models.observation import Observation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, of_rows
+from turbopi.models.pi0.integrate import Integrated, integrate
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.preprocess.images import fit_unit
+from turbopi.support.errors import BackendError
+from turbopi.support.toolchain import make_caches_writable
+
+Images = Sequence[np.ndarray]  # of one observation's valid cameras: uint8[h, w, 3], or float32 as the model reads it
+
+
+@dataclass
+class _Step:
+    """A captured evaluation of the expert: x float32[1, H, A], time float32[1, D] or [1, H, D], v as x."""
+
+    x: Tensor
+    time: Tensor
+    v: Tensor
+    graph: Graph
+
+
+@dataclass
+class _Graphs:
+    """Of so many cameras: the inputs' places, what the prefix leaves, and the steps behind it by horizon.
+
+    behind  what the expert makes of the cache once a call
+    steps   (horizon, whether each action has its own time) -> step
+    """
+
+    inputs: Observation
+    vision: Graph
+    prefix: Graph
+    cache: KVCache
+    behind: Any
+    steps: dict[tuple[int, bool], _Step] = field(default_factory=dict)
+
+
+class CapturedBackend(PyTorchBackend):
+    """The reference of a family, its stages through torch.compile where there is a compiler, in CUDA graphs."""
+
+    name: ClassVar[str] = "cuda_graph"
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens")
+    begins: ClassVar[bool] = True
+
+    @classmethod
+    def unavailable(cls, device: torch.device) -> str | None:
+        return CudaGraphBackend.unavailable(device)
+
+    def load_weights(self, load: LoadState) -> None:
+        make_caches_writable()
+        super().load_weights(load)
+        if self.precision == "bf16":
+            self.model.attend = _attend
+        self._graphs: dict[int, _Graphs] = {}  # by number of cameras
+        self._pool = torch.cuda.graph_pool_handle()
+        self._stream: torch.cuda.Stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
+        self._times: dict[bytes, Tensor] = {}
+        self._turn: object = None  # of the observation whose images are in the inputs
+        self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
+        stages = (self.model.embed_images, self._prefix_stage, self.model.velocity)
+        self._embed_images, self._prefix_of, self._velocity = map(self._stage, stages)
+
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+        conditioning: Conditioning | None = None,
+    ) -> None:
+        graphs = self._captured(int(observation.image_mask[0].sum()))
+        self._step(graphs, horizon or self.config.action_horizon, by_action=False)
+        if conditioning is not None and conditioning.form == "tokens":
+            self._step(graphs, horizon or self.config.action_horizon, by_action=True)
+
+    def begin_batch(
+        self,
+        images: Sequence[Images],
+        resize: ImageResize | None = None,
+        forms: Sequence[Form] | None = None,
+    ) -> BegunBatch:
+        return _Begun(self, images, resize or "lerobot")
+
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        images, tokens, state = _on_host(observation)
+        return self.begin_batch(images).finish(tokens, state, noise.cpu().numpy(), num_steps, conditioning)
+
+    def prefix(self, observation: Observation) -> KVCache:
+        raise self._lacks("halves of a call", "call `sample`")
+
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
+        raise self._lacks("halves of a call", "call `sample`")
+
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
+        """Of the captured graphs, one observation after the other: places of the prefix that none has are 0."""
+        self.check_conditioning(conditioning)
+        images, tokens, state = _on_host(observation)
+        traces = []
+        for row, one in enumerate(of_rows(conditioning, len(tokens))):
+            turn, inputs = self.see(images[row], "lerobot"), (tokens[row], state[row], noise[row].cpu().numpy())
+            timer = StageTimer(self.device)
+            done = self.answer(turn, len(images[row]), *inputs, num_steps, one, timer, keep=True)
+            cache = self._graphs[len(images[row])].cache
+            assert cache.mask is not None
+            trace = {name: part[:, :, :, cache.mask[0]].transpose(2, 3) for name, part in _parts(cache)}
+            trace["x_t"] = torch.stack([x for x, _, _ in done.evaluations] + [done.actions])
+            trace["v_t"] = torch.stack([v for _, _, v in done.evaluations])
+            traces.append(trace | {"actions": done.actions})
+        return {name: _joined([one[name] for one in traces], int(name != "actions")) for name in traces[0]}
+
+    def describe(self) -> dict[str, Any]:
+        return {"compiled": self._compiles, "cameras": sorted(self._graphs)}
+
+    # -- one observation -----------------------------------------------------------------------------------------------
+
+    def see(self, images: Images, resize: ImageResize) -> object:
+        """Start on its images; what `answer` needs to know that nobody else has started since."""
+        if self.strict and len(images) not in self._graphs:
+            raise self._cold(len(images), self.config.action_horizon)
+        graphs = self._captured(len(images))
+        for image, place in zip(images, graphs.inputs.images[0], strict=True):
+            if image.dtype == np.float32:  # as the model reads it
+                place.copy_(torch.from_numpy(image))
+            else:
+                on_device = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
+                place.copy_(fit_unit(on_device[None].float() / 255, tuple(place.shape[:2]), resize)[0])
+        graphs.vision.launch()
+        self._turn = object()
+        return self._turn
+
+    def answer(
+        self,
+        turn: object,
+        cameras: int,
+        tokens: np.ndarray,
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditioning | None,
+        timer: StageTimer,
+        *,
+        keep: bool = False,
+    ) -> Integrated:
+        """Its actions, on the device; keep: and all that led to them."""
+        if turn is not self._turn:
+            raise BackendError("another observation was begun before this one was finished")
+        graphs, count = self._captured(cameras), len(tokens)
+        padded = np.zeros((2, self.config.max_prompt_tokens), np.int64)
+        padded[0, :count], padded[1, :count] = tokens, 1
+        on_device = torch.from_numpy(padded).to(self.device)
+        graphs.inputs.tokens.copy_(on_device[:1])
+        graphs.inputs.token_mask.copy_(on_device[1:])
+        graphs.inputs.state.copy_(torch.from_numpy(state)[None])
+        graphs.prefix.launch()
+        timer.mark("prefix")
+
+        def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+            if self.strict and (x.shape[1], time.ndim == 3) not in graphs.steps:
+                raise self._cold(cameras, x.shape[1], conditioned=time.ndim == 3)
+            step = self._step(graphs, x.shape[1], by_action=time.ndim == 3)
+            step.x.copy_(x)
+            step.time.copy_(time)
+            step.graph.launch()
+            return step.v, step.v.clone()
+
+        x_1 = torch.from_numpy(noise)[None].to(self.device)
+        grid = self.config.time_grid
+        with torch.no_grad():
+            done = integrate(velocity, self._embed_times, x_1, num_steps, conditioning, grid=grid, keep=keep)
+        timer.mark("denoise")
+        return done
+
+    # -- graphs --------------------------------------------------------------------------------------------------------
+
+    def _stage(self, stage: Callable[..., Any]) -> Callable[..., Any]:
+        return compile_stage(stage, dynamic=False) if self._compiles else stage
+
+    def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any]:
+        prefix = self.model.embed_prefix(observation, embedded=embedded)
+        k, v, _ = self.model.encode_prefix(prefix)
+        cache = self.model.cache_of(prefix, k, v)
+        return cache, self.model.cross_keys_values(cache)
+
+    def _captured(self, cameras: int) -> _Graphs:
+        if cameras not in self._graphs:
+            with building(self.device), torch.no_grad():
+                self._graphs[cameras] = self._capture(cameras)
+        return self._graphs[cameras]
+
+    def _capture(self, cameras: int) -> _Graphs:
+        config, side, prompt = self.config, self.config.image_size, self.config.max_prompt_tokens
+        inputs = Observation(
+            torch.zeros(1, cameras, side, side, 3),
+            torch.ones(1, cameras, dtype=torch.bool),
+            torch.zeros(1, prompt, dtype=torch.int64),
+            torch.ones(1, prompt, dtype=torch.bool),
+            torch.zeros(1, config.state_dim),
+        ).to(self.device)
+        images: list[Tensor] = []
+        left: list[tuple[KVCache, Any]] = []
+
+        def vision(mark: Callable[[str], None]) -> None:
+            images[:] = [self._embed_images(inputs.images[0])]
+            mark("vision")
+
+        def prefix(mark: Callable[[str], None]) -> None:
+            left[:] = [self._prefix_of(inputs, images[0])]
+            mark("prefix")
+
+        first = Graph(vision, self._pool, self._stream)
+        second = Graph(prefix, self._pool, self._stream)
+        return _Graphs(inputs, first, second, *left[0])
+
+    def _step(self, graphs: _Graphs, horizon: int, *, by_action: bool) -> _Step:
+        if (horizon, by_action) not in graphs.steps:
+            x = torch.zeros(1, horizon, self.config.action_dim, device=self.device)
+            time = self._embed_times(np.ones(1, np.float32))
+            time = time[:, None].repeat(1, horizon, 1) if by_action else time.clone()
+            made: list[Tensor] = []
+
+            def step(mark: Callable[[str], None]) -> None:
+                made[:] = self._velocity(x, time, graphs.cache, graphs.behind)
+                mark("denoise")
+
+            with building(self.device), torch.no_grad():
+                graph = Graph(step, self._pool, self._stream)
+            graphs.steps[horizon, by_action] = _Step(x, time, made[1], graph)
+        return graphs.steps[horizon, by_action]
+
+    def _cold(self, cameras: int, horizon: int, *, conditioned: bool = False) -> Exception:
+        warm = [f"{count} cameras, H={h}" for count, one in self._graphs.items() for h, _ in one.steps]
+        needs = f"{cameras} cameras, H={horizon}"
+        return cold_call(self.name, needs, warm, conditioned=conditioned, cameras=cameras, horizons=horizon)
+
+    def _embed_times(self, times: np.ndarray) -> Tensor:
+        key = times.tobytes()
+        if key not in self._times:
+            if len(self._times) >= 64:
+                self._times.clear()
+            self._times[key] = self.model.embed_times(times).to(self.device)
+        return self._times[key]
+
+
+class _Begun:
+    """`BegunBatch` of observations that run one by one; the device works on the first one's images already."""
+
+    def __init__(self, backend: CapturedBackend, images: Sequence[Images], resize: ImageResize) -> None:
+        self._backend, self._images, self._resize = backend, images, resize
+        self._timer = StageTimer(backend.device)
+        self._turn = backend.see(images[0], resize)
+        self._timer.mark("vision")
+
+    def finish(
+        self,
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditionings = None,
+    ) -> Sample:
+        self._backend.check_conditioning(conditioning)
+        each = of_rows(conditioning, len(tokens))
+        actions, stages = [], []
+        for row, one in enumerate(each):
+            if row:
+                self._timer = StageTimer(self._backend.device)
+                self._turn = self._backend.see(self._images[row], self._resize)
+                self._timer.mark("vision")
+            inputs = (tokens[row], state[row], noise[row], num_steps, one)
+            made = self._backend.answer(self._turn, len(self._images[row]), *inputs, self._timer)
+            actions.append(made.actions.cpu())
+            stages.append(self._timer.milliseconds())
+        return Sample(torch.cat(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
+
+
+def _on_host(observation: Observation) -> tuple[list[Images], list[np.ndarray], np.ndarray]:
+    """Of each observation its valid images and prompt tokens; and the states."""
+    host = observation.to("cpu")
+    rows = range(host.batch_size)
+    images: list[Images] = [list(host.images[row][host.image_mask[row]].numpy()) for row in rows]
+    return images, [host.tokens[row][host.token_mask[row]].numpy() for row in rows], host.state.numpy()
+
+
+def _parts(cache: KVCache) -> tuple[tuple[str, Tensor], tuple[str, Tensor]]:
+    return ("kv_k", cache.k), ("kv_v", cache.v)
+
+
+def _joined(parts: list[Tensor], axis: int) -> Tensor:
+    """Rows of a batch; those of fewer places are filled up with zeros."""
+    if len({part.shape for part in parts}) > 1:
+        places = max(part.shape[2] for part in parts)
+        parts = [F.pad(part, (0, 0, 0, 0, 0, places - part.shape[2])) for part in parts]
+    return torch.cat(parts, dim=axis)
+
+
+def _attend(q_BHSK: Tensor, k_BGTK: Tensor, v_BGTK: Tensor, mask: Tensor) -> Tensor:
+    """As the reference's `attention`, in one kernel: products of the values' dtype, sums in float32."""
+    groups = q_BHSK.shape[1] // k_BGTK.shape[1]
+    k, v = (x.to(v_BGTK.dtype).repeat_interleave(groups, dim=1) for x in (k_BGTK, v_BGTK))
+    return F.scaled_dot_product_attention(q_BHSK.to(v.dtype), k, v, attn_mask=mask)

@@ -1,0 +1,193 @@
+"""LeRobot's `smolvla` checkpoints: config.json, the processors, and the vision-language model's own config.json.
+
+LeRobot's config.json holds no sizes of the vision-language model: it names a repository, whose config is in the Hub's
+cache. It is read from the folder that turbopi.json names as `vlm`, from the checkpoint, from the Hub's cache, or, of
+published models, from what is known of them. The tensors must fit what it says.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+from turbopi.checkpoint.lerobot import LeRobotFolder
+from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
+from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE
+from turbopi.config import LIMITS, Normalization, PolicyConfig
+from turbopi.models import Family
+from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
+from turbopi.models.smolvla.names import canonical_name, native_name
+from turbopi.support.errors import CheckpointError
+from turbopi.support.hub_cache import hub_folder
+from turbopi.support.reading import Fields, read_json, shown
+
+_VLM = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+_COUNTS = {  # keys, and the limits of turbopi.config for them
+    "num_vlm_layers": "depth",
+    "chunk_size": "action_horizon",
+    "tokenizer_max_length": "max_prompt_tokens",
+    "max_state_dim": "action_dim",
+    "max_action_dim": "action_dim",
+}
+_TOKENIZER, _TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
+
+
+class SmolVLANames:
+    """LeRobot's names. depth: text layers that the network uses; files hold more of them."""
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth
+
+    def canonical(self, key: str) -> str | None:
+        return canonical_name(key, self._depth)
+
+    def native(self, name: str) -> str:
+        return native_name(name)
+
+
+class SmolVLAFolder(LeRobotFolder):
+    """As `LeRobotFolder`. vlm_source: where the vision-language model's sizes are from, for messages."""
+
+    keys: ClassVar[Keys] = SMOLVLA
+
+    def _described(self) -> PolicyConfig:
+        return PolicyConfig(
+            name="lerobot_smolvla",
+            model=self._network(),
+            robot="lerobot",
+            normalization=self.normalization,
+            robot_options=self._robot_options(),
+            discrete_state_input=False,
+            image_resize="lerobot_smolvla",
+            prompt_as_is=True,
+            num_denoising_steps=self._steps("num_steps"),
+            real_time=self._real_time(),
+        )
+
+    def notes(self) -> list[str]:
+        notes = super().notes()
+        if self.settings.policy is None:
+            notes += [
+                f"{file} has no statistics of {what}, though it scales them by {mode}: LeRobot leaves them as they "
+                "are, and so does Turbo-Pi. Fine-tune the policy, or take a checkpoint with this robot's statistics"
+                for file, what, mode, stats in (
+                    (PREPROCESSOR, STATE, self._claimed("STATE"), self.stats.state),
+                    (POSTPROCESSOR, ACTION, self._claimed("ACTION"), self.stats.actions),
+                )
+                if stats is None and mode != "IDENTITY"
+            ]
+        return notes
+
+    @property
+    def normalization(self) -> Normalization:
+        """What isn't there scales nothing, as in LeRobot; `notes` says so."""
+        found = super().normalization
+        if "normalization" in self.settings.values:
+            return found
+        return Normalization(
+            "identity" if self.stats.state is None else found.state,
+            "identity" if self.stats.actions is None else found.actions,
+        )
+
+    @property
+    def vlm_name(self) -> str:
+        return self.config.text("vlm_model_name", _VLM)
+
+    def _claimed(self, kind: str) -> str:
+        return str(self.config.object("normalization_mapping", {}).values.get(kind, "IDENTITY"))
+
+    def _notes_on_version(self) -> list[str]:
+        return []  # the same in all of them, from floats or bytes in [0, 1]
+
+    def _check_family(self, family: Family) -> None:
+        size = self.config.values.get("resize_imgs_with_padding", [512, 512])
+        square = isinstance(size, list) and len(size) == 2 and size[0] == size[1] and isinstance(size[0], int)
+        if not square or not 1 <= size[0] <= LIMITS["image_size"]:
+            raise CheckpointError(
+                f"{self.file} has resize_imgs_with_padding = {shown(size)}; Turbo-Pi reads a square size, such as "
+                "[512, 512]"
+            )
+        given = self.config.values.keys()
+        for key in given & _COUNTS.keys():
+            self.config.integer(key, 1, LIMITS[_COUNTS[key]])
+        for key in given & {"num_expert_layers", "prefix_length", "self_attn_every_n_layers"}:
+            self.config.integer(key, -1, LIMITS["max_prompt_tokens"])
+        for key in given & {"min_period", "max_period", "expert_width_multiplier"}:
+            self.config.number(key, 1e-6, 1e6)
+        for key in ("load_vlm_weights", "add_image_special_tokens"):
+            self.config.flag(key, False)
+        self.config.text("attention_mode", "cross_attn")
+
+    def _network(self) -> SmolVLAConfig:
+        vlm, source = self._vlm()
+        try:
+            network = from_lerobot(self.config.values, {**vlm, **self._special_tokens()})
+        except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+            raise CheckpointError(
+                f"{source} isn't a config of a SmolVLM: {type(error).__name__} at {error}; expected its "
+                "text_config and vision_config with their sizes"
+            ) from error
+        problem = _problem(network)
+        if problem is not None:
+            raise CheckpointError(f"{self.file} with the sizes of {source}: {problem}; LeRobot can't run it either")
+        return network
+
+    def _vlm(self) -> tuple[Mapping[str, Any], str]:
+        """The vision-language model's config, and where it is from."""
+        for folder in self._vlm_folders():
+            if (file := folder / "config.json").is_file() and "text_config" in (found := read_json(file)):
+                return Fields(found, file).values, str(file)
+        if self.vlm_name in PUBLISHED:
+            return PUBLISHED[self.vlm_name], f"what is known of {self.vlm_name}"
+        raise CheckpointError(
+            f"{self.file} names the vision-language model {shown(self.vlm_name)}, whose config.json holds the sizes, "
+            f"and it isn't in the Hub's cache. Fetch it (hf download {self.vlm_name} config.json tokenizer.json "
+            'tokenizer_config.json), or put its folder into a turbopi.json: {"vlm": "/path/to/it"}'
+        )
+
+    def _vlm_folders(self) -> list[Path]:
+        own = self.settings.values.get("vlm")
+        named = [Path(own)] if own else [self.folder / self.vlm_name, Path(self.vlm_name)]
+        cached = hub_folder(self.vlm_name)
+        return [*named, *([] if own or cached is None else [cached])]
+
+    def _special_tokens(self) -> dict[str, tuple[int, ...]]:
+        """Ids of the tokens around images, which LeRobot asks the model's own tokenizer for; {}: the published ones."""
+        if not self.config.flag("add_image_special_tokens", False):
+            return {}
+        for folder in self._vlm_folders():
+            if not (folder / _TOKENIZER).is_file() or not (folder / _TOKENIZER_CONFIG).is_file():
+                continue
+            words = Fields(read_json(folder / _TOKENIZER_CONFIG), folder / _TOKENIZER_CONFIG)
+            around, whole = (
+                words.text(key, default)
+                for key, default in (
+                    ("fake_image_token", "<fake_token_around_image>"),
+                    ("global_image_token", "<global-img>"),
+                )
+            )
+            added = read_json(folder / _TOKENIZER, limit=64 * 2**20).get("added_tokens") or []
+            ids = {one.get("content"): one.get("id") for one in added if isinstance(one, dict)}
+            first, second = ids.get(around), ids.get(whole)
+            if not (isinstance(first, int) and isinstance(second, int)):
+                raise CheckpointError(f"{folder / _TOKENIZER} has no tokens {around} and {whole} among added_tokens")
+            return {"image_start_token_ids": (first, second), "image_end_token_ids": (first,)}
+        return {}
+
+
+def _problem(network: SmolVLAConfig) -> str | None:
+    """What doesn't fit together, if anything."""
+    vision, text = network.vision, network.text
+    for name, value in (
+        *((f"vision {key}", getattr(vision, key)) for key in ("width", "depth", "mlp_dim", "num_heads", "patch_size")),
+        *((f"text {key}", getattr(text, key)) for key in ("width", "mlp_dim", "num_heads", "num_kv_heads", "head_dim")),
+    ):
+        if not isinstance(value, int) or value < 1:
+            return f"{name} is {shown(value)}"
+    side, factor = network.image_size // vision.patch_size, network.scale_factor
+    if side * vision.patch_size != network.image_size or side % factor:
+        return f"images of {network.image_size} pixels aren't whole patches, {factor} by {factor} of them together"
+    if vision.width % vision.num_heads or text.num_heads % text.num_kv_heads or text.head_dim % 2:
+        return "heads don't divide the widths"
+    if network.expert_depth < 1 or text.depth % network.expert_depth:
+        return f"{network.expert_depth} layers of the expert don't go into {text.depth} text layers"
+    return None

@@ -1,0 +1,57 @@
+"""LeRobot's golden checkpoints of SmolVLA as its users have them: a folder, and the Hub's cache beside it."""
+
+import json
+import lzma
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+COMMIT = "0" * 40
+GOLDEN = Path(__file__).parent / "golden_smolvla"
+
+
+def make_hub(folder: Path) -> Path:
+    """A Hub cache with the stand-ins of the vision-language models."""
+    for one in (GOLDEN / "hub/HuggingFaceTB").iterdir():
+        repository = folder / f"models--HuggingFaceTB--{one.name}"
+        shutil.copytree(one, repository / "snapshots" / COMMIT)
+        (repository / "refs").mkdir()
+        (repository / "refs/main").write_text(COMMIT)
+    return folder
+
+
+def make_checkpoint(name: str, folder: Path) -> Path:
+    """A case's checkpoint with its weights unpacked."""
+    shutil.copytree(GOLDEN / name / "checkpoint", folder)
+    packed = (GOLDEN / name / "model.safetensors.xz").read_bytes()
+    (folder / "model.safetensors").write_bytes(lzma.decompress(packed))
+    return folder
+
+
+class GoldenRuns:
+    """A case's observations and what LeRobot computed from them."""
+
+    def __init__(self, name: str) -> None:
+        self.described = json.loads((GOLDEN / name / "case.json").read_text())
+        self._inputs = dict(np.load(GOLDEN / name / "inputs.npz"))
+        self._expected = dict(np.load(GOLDEN / name / "expected.npz"))
+
+    @property
+    def noise(self) -> np.ndarray:
+        return self._inputs["noise"]
+
+    @property
+    def previous(self) -> np.ndarray:
+        return self._inputs["previous"]
+
+    def __len__(self) -> int:
+        return len(self.described["runs"])
+
+    def observation(self, run: int) -> dict[str, object]:
+        prefix = f"{self.described['runs'][run]['observation']}/"
+        found = {key.removeprefix(prefix): one for key, one in self._inputs.items() if key.startswith(prefix)}
+        return {key: str(one.reshape(-1)[0]) if one.dtype.kind == "U" else one for key, one in found.items()}
+
+    def actions(self, run: int, part: str = "") -> np.ndarray:
+        return self._expected[f"{run}/{part}actions"]

@@ -1,0 +1,166 @@
+"""SmolVLA through `UnifiedPolicy`, from checkpoint folders as LeRobot writes them, against what LeRobot computed."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_checkpoint, make_hub
+
+from turbopi import UnifiedPolicy
+from turbopi.checkpoint import open_checkpoint
+from turbopi.preprocess.images import fit_unit, fitted
+from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, TokenizerError
+
+pytest.importorskip("tokenizers", reason="SmolVLA's prompts need the extra `smolvla`")
+SCHEDULES: Any = {"LINEAR": "linear", "EXP": "exponential", "ONES": "ones", "ZEROS": "zeros"}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """hub/ and each case's folder, as `CASE/checkpoint`: peft's base is beside it."""
+    root = tmp_path_factory.mktemp("smolvla")
+    make_hub(root / "hub")
+    for one in GOLDEN.iterdir():
+        if (one / "model.safetensors.xz").is_file():
+            make_checkpoint(one.name, root / one.name / "checkpoint")
+    make_adapter = root / "peft" / "checkpoint"
+    make_adapter.mkdir(parents=True)
+    for file in (GOLDEN / "peft/checkpoint").iterdir():
+        (make_adapter / file.name).write_bytes(file.read_bytes())
+    return root
+
+
+@pytest.fixture
+def hub(folders: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HF_HUB_CACHE", str(folders / "hub"))
+    return folders / "hub"
+
+
+def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
+    assert ours.shape == theirs.shape
+    exact = theirs.astype(np.float64)
+    return float(np.sqrt(np.square(ours - exact).mean() / np.square(exact).mean()))
+
+
+@pytest.mark.parametrize("name", ["base", "missing_camera", "special_tokens", "long_prompt", "peft", "bf16"])
+def test_a_folder_of_lerobots_gives_its_actions(name: str, folders: Path, hub: Path) -> None:
+    policy, golden = UnifiedPolicy(folders / name / "checkpoint", precision="f32"), GoldenRuns(name)
+    assert policy.metadata["model"] == "smolvla"
+    for run in range(len(golden)):
+        actions = policy.infer(golden.observation(run), noise=golden.noise)["actions"]
+        assert relative(actions, golden.actions(run, "float32/" if name == "bf16" else "")) <= 2e-5  # seen: 3e-6
+
+
+def test_bfloat16_is_lerobots_own(folders: Path, hub: Path) -> None:
+    policy, golden = UnifiedPolicy(folders / "bf16" / "checkpoint", precision="bf16"), GoldenRuns("bf16")
+    for run in range(len(golden)):
+        actions = policy.infer(golden.observation(run), noise=golden.noise)["actions"]
+        assert relative(actions, golden.actions(run)) <= 5e-2
+
+
+def test_chunks_join_as_in_lerobot(folders: Path, hub: Path) -> None:
+    policy, golden = UnifiedPolicy(folders / "rtc" / "checkpoint", precision="f32"), GoldenRuns("rtc")
+    assert policy.metadata["real_time"]["modes"] == ["rtc", "rtc_identity"]
+    horizon, joined = policy.config.model.action_horizon, 0
+    for run, one in enumerate(golden.described["runs"]):
+        rtc = one["rtc"]
+        if not rtc["prev_rows"] or rtc["inference_delay"] > rtc["execution_horizon"]:
+            continue
+        left_over = golden.previous[-rtc["prev_rows"] :].astype(np.float32)
+        end = rtc["execution_horizon"]
+        chunk = RunningChunk(
+            left_over=np.pad(left_over, ((0, 0), (0, 32 - left_over.shape[1]))),
+            delay=rtc["inference_delay"],
+            execution_horizon=horizon - end if end < horizon else None,
+            mode="rtc_identity",
+            schedule=SCHEDULES[rtc["schedule"]],
+            max_guidance_weight=rtc["max_guidance_weight"],
+        )
+        actions = policy.infer(golden.observation(run), noise=golden.noise, previous=chunk)["actions"]
+        assert relative(actions, golden.actions(run)) <= 2e-5
+        joined += 1
+    assert joined >= 5
+
+
+def test_a_batch_is_its_observations_one_by_one(folders: Path, hub: Path) -> None:
+    policy, golden = UnifiedPolicy(folders / "base" / "checkpoint", precision="f32"), GoldenRuns("base")
+    several = [golden.observation(run) for run in range(2)]
+    together = policy.infer_batch(several, seed=1)
+    for row, one in enumerate(several):
+        alone = policy.infer(one, seed=1 + row)["actions"]
+        assert relative(together[row]["actions"], alone) <= 1e-5
+
+
+def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "nothing"))
+    with pytest.raises(CheckpointError, match="don't fit the model"):  # the published sizes aren't these
+        open_checkpoint(folders / "base" / "checkpoint")
+    other = make_checkpoint("base", tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps(config | {"vlm_model_name": "somebody/else"}))
+    with pytest.raises(CheckpointError, match="hf download somebody/else config"):
+        open_checkpoint(other)
+    vlm = folders / "hub/models--HuggingFaceTB--SmolVLM2-500M-Video-Instruct/snapshots" / COMMIT
+    (other / "turbopi.json").write_text(json.dumps({"vlm": str(vlm)}))
+    assert open_checkpoint(other).config.model.vocab_size == 352
+    with pytest.raises(TokenizerError, match="hf download NAME tokenizer"):
+        UnifiedPolicy(other)
+    assert UnifiedPolicy(other, tokenizer=vlm).metadata["tokenizer"] == str(vlm / "tokenizer.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"adapt_to_pi_aloha": True}, "adapt_to_pi_aloha = True, which Turbo-Pi doesn't compute"),
+        ({"resize_imgs_with_padding": [512, 384]}, r"resize_imgs_with_padding = \[512, 384\]"),
+        ({"resize_imgs_with_padding": None}, "resize_imgs_with_padding = None"),
+        ({"num_vlm_layers": 0}, "num_vlm_layers is 0"),
+        ({"num_expert_layers": 3}, "3 layers of the expert don't go into 4 text layers"),
+    ],
+)
+def test_what_is_not_computed_is_refused_by_its_key(
+    change: dict[str, object], message: str, hub: Path, tmp_path: Path
+) -> None:
+    folder = make_checkpoint("base", tmp_path / "changed")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | change))
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+def test_statistics_that_are_not_there_are_said_and_nothing_is_scaled(hub: Path, tmp_path: Path) -> None:
+    """As in lerobot/smolvla_base, whose files have another dataset's alone."""
+    from safetensors.numpy import load_file, save_file
+
+    folder = make_checkpoint("base", tmp_path / "unscaled")
+    for file in folder.glob("policy_*.safetensors"):
+        save_file({f"so100.buffer.{key}": value for key, value in load_file(file).items()}, file)
+    policy, golden = UnifiedPolicy(folder, precision="f32"), GoldenRuns("base")
+    notes = [note for note in open_checkpoint(folder).source.notes if "has no statistics of" in note]
+    assert len(notes) == 2
+    assert "observation.state" in notes[0] and "action" in notes[1]
+    answer = policy.infer(golden.observation(0), noise=golden.noise, model_actions=True)
+    assert np.array_equal(answer["actions"], answer["model_actions"][:, :6].astype(np.float64))
+
+
+def test_what_has_no_plan_for_it_says_so(folders: Path, hub: Path) -> None:
+    checkpoint = folders / "base" / "checkpoint"
+    with pytest.raises(BackendUnavailable, match="has no plan for SmolVLA"):
+        UnifiedPolicy(checkpoint, backend="pytorch_compile")
+    policy = UnifiedPolicy(checkpoint, precision="f32")
+    with pytest.raises(ConfigError, match="this is for Pi0 and Pi0"):
+        _ = policy.config.planned_model
+    with pytest.raises(ObservationError, match="the observation has no camera"):
+        policy.infer({"observation.state": np.zeros(6, np.float32), "task": "x"})
+
+
+def test_images_are_fitted_on_a_device_as_on_the_host() -> None:
+    for shape in ((48, 64, 3), (100, 30, 3), (128, 128, 3)):
+        image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+        for resize in ("lerobot_smolvla", "lerobot", "lerobot_0.4"):
+            ours = fit_unit(torch.from_numpy(image)[None] / 255, (128, 128), resize)[0]
+            assert np.abs(ours.numpy() - fitted(image, 128, resize)).max() <= 3e-7
