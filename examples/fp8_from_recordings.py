@@ -58,7 +58,7 @@ def main() -> None:
     turbopi("calibrate", SMALL_POLICY, "--observations", recordings, "--out", fp8)  # 2. calibrate
 
     judged = ("--backend", options.backend, "--precision", "fp8", "--quantization", fp8)  # 3. verify
-    turbopi("verify", SMALL_POLICY, "--observations", recordings, "--count", "2", *judged)
+    turbopi("verify", SMALL_POLICY, "--observations", recordings, "--count", "2", "--noises", "1", *judged)
 
     policy = UnifiedPolicy(SMALL_POLICY, backend=options.backend, precision="fp8", quantization=fp8)  # 4. serve
     with serve.running(policy) as server:

@@ -25,11 +25,11 @@ from shared import (  # noqa: F401
 
 # Those that take longest, longest first.
 LONGEST = (
-    *("test_serve_fleet_faults", "test_sim_libero", "test_examples", "test_tutorial", "test_emulated_fp8", "test_onnx"),
-    *("test_onnx_fp8", "test_engine_batch_conditioned", "test_kernels_denoise_by_token", "test_engine_backward"),
-    *("test_studies_simulated", "test_kernels_portable_denoise_emulated", "test_backends", "test_verify"),
-    *("test_calibrate", "test_bench", "test_checkpoint_memory", "test_gpu_evidence", "test_kernels_emulated"),
-    *("test_kernels_denoise_emulated", "test_kernels_attention_emulated", "test_serve_schedule", "test_cli_tables"),
+    *("test_serve_fleet_faults", "test_sim_libero", "test_tutorial", "test_onnx", "test_backends", "test_gpu_evidence"),
+    *("test_engine_backward", "test_kernels_portable_denoise_emulated", "test_examples", "test_studies_simulated"),
+    *("test_kernels_attention_emulated", "test_engine_batch_conditioned", "test_kernels_emulated", "test_engine"),
+    *("test_kernels_denoise_emulated", "test_emulated_fp8", "test_checkpoint_memory", "test_bench", "test_calibrate"),
+    *("test_kernels_denoise_by_token", "test_serve_schedule", "test_kernels_denoise", "test_onnx_fp8"),
 )
 
 

@@ -1,7 +1,6 @@
 """Fingerprints that are remembered: when they are used, and when they aren't."""
 
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from turbopi.checkpoint import base, known_hashes, open_checkpoint
+from turbopi.checkpoint import base, convert, known_hashes, open_checkpoint
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.source import Piece
+from turbopi.policy.shipped import SMALL_POLICY
 
-SMALL = Path(base.__file__).parents[1] / "data" / "small_policy"
 WEIGHTS = "model.safetensors"
 
 
@@ -21,8 +20,7 @@ WEIGHTS = "model.safetensors"
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A checkpoint whose files have been as they are for a minute, and an empty cache."""
     monkeypatch.setattr(known_hashes, "cache_folder", lambda: tmp_path / "cache" / "turbopi")
-    copied = tmp_path / "checkpoint"
-    shutil.copytree(SMALL, copied)
+    copied = convert(SMALL_POLICY, tmp_path / "checkpoint", precision="bf16")
     settle(copied / WEIGHTS, 60)
     return copied
 

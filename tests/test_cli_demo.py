@@ -157,7 +157,8 @@ def test_the_pictures_reach_every_robots_cameras(preset: str) -> None:
     policy = UnifiedPolicy(checkpoint, backend="pytorch", robot=robot) if robot == "libero" else _for_robot(robot)
     (observation,) = shipped.observations(policy, [frame])
     inputs, _ = policy._pipeline.before(observation)
-    expected = np.asarray(Image.fromarray(frame.base).resize((224, 224), Image.Resampling.BILINEAR))
+    size = (policy.config.planned_model.vision.image_size,) * 2
+    expected = np.asarray(Image.fromarray(frame.base).resize(size, Image.Resampling.BILINEAR))
     np.testing.assert_array_equal(inputs.images[0], expected)
     assert inputs.image_mask[:2].all()
     assert not np.array_equal(inputs.images[0], inputs.images[1])

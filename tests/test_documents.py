@@ -154,7 +154,7 @@ def test_a_place_that_names_nothing_is_refused(tmp_path: Path, table: str, said:
 def test_a_report_of_a_study_that_was_changed_by_hand_is_found_and_written_anew(tmp_path: Path) -> None:
     folder = tmp_path / "benchmarks" / "results" / "some" / "mask"
     folder.mkdir(parents=True)
-    for file in (RESULT.parents[1] / "cpu_2026-11-24_studies" / "mask").iterdir():
+    for file in (RESULT.parents[1] / "cpu_2026-11-26_studies" / "mask").iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     assert studies.stale_reports(tmp_path) == [] == studies.write_reports(tmp_path)
     text = folder / "report.md"

@@ -62,12 +62,12 @@ def close(ours: Tensor, exact: Tensor) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", BY_TOKEN)
-def test_every_form_by_token_runs_in_one_call_beside_plain_observations(engine: OnCpu, which: str) -> None:
+@pytest.mark.parametrize("which", [BY_TOKEN[:3], BY_TOKEN[3:]], ids=" ".join)
+def test_every_form_by_token_runs_in_one_call_beside_plain_observations(engine: OnCpu, which: list[str]) -> None:
     """Other cameras, prompts of other lengths, one without an image, one without a prompt."""
     kind = engine.config.kind
     made, noise = observations(kind, CAMERAS, TOKENS, H)
-    reported = requested(which, None, which, which)
+    reported = requested(which[0], None, *which[1:])
     engine.reported.clear()
     close(engine.sample(made, noise, STEPS, conditioning=reported).actions, golden_model(kind).sample(
         made, noise, STEPS, conditioning=reported
@@ -77,11 +77,11 @@ def test_every_form_by_token_runs_in_one_call_beside_plain_observations(engine: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", JACOBIAN)
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 3])
 def test_the_true_jacobian_goes_back_through_each_observations_own_prefix(
     engine: OnCpu, which: str, count: int
 ) -> None:
-    """Three are a call with an empty place."""
+    """Three are a call of four with an empty place."""
     kind = engine.config.kind
     made, noise = observations(kind, CAMERAS[:count], TOKENS[:count], H)
     reported = requested(*[which] * count)

@@ -15,7 +15,7 @@ from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
 from turbopi.serve import running
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("two_layers")]
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -109,7 +109,7 @@ def test_a_robot_of_ones_own_is_a_file_or_a_class() -> None:
 
 
 def test_recordings_become_fp8(tmp_path: Path) -> None:
-    shown = run("fp8_from_recordings.py", "--folder", "here", "--frames", "4", cwd=tmp_path)
+    shown = run("fp8_from_recordings.py", "--folder", "here", "--frames", "2", cwd=tmp_path)
     assert "PASS" in shown and "in FP8 answers with actions [16, 7]" in shown
     assert (tmp_path / "here" / "fp8.json").is_file()
 

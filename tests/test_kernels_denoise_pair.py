@@ -48,10 +48,10 @@ SHAPES = pytest.mark.parametrize(
 @pytest.mark.slow
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(("suffix", "fp8"), [(20, False), (32, True)])
-def test_the_source_compiles_for_hopper(tmp_path: Path, suffix: int, fp8: bool) -> None:
+def test_the_source_compiles_for_hopper(cubins: Path, suffix: int, fp8: bool) -> None:
     arrangement = packing.Arrangement(CONFIGS["full"])
     sizes = denoise.kernel_sizes(arrangement, cache_rows=1440, suffix=suffix, shared_bytes=232448, fp8=fp8, pair=True)
-    assert denoise.compiled("sm_90a", sizes, folder=tmp_path)
+    assert denoise.compiled("sm_90a", sizes, folder=cubins)
 
 
 def pair_of(p: Problem, lengths: tuple[int, int]) -> tuple[Problem, Problem]:

@@ -16,6 +16,7 @@ from turbopi.config import Normalization, NormMode, PiKind, PolicyConfig, preset
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import BackendUnavailable, ConfigError, ObservationError, TokenizerError
 
+pytestmark = pytest.mark.usefixtures("two_layers")
 H = 10
 
 

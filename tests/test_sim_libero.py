@@ -1,14 +1,13 @@
 """The protocol, in the real simulator. Skipped without it: pip install 'turbopi[libero]', and libosmesa6 or EGL."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy
 
 from turbopi.evaluate.plan import Protocol, VideoPlan, choose_tasks, make_jobs
@@ -32,6 +31,16 @@ PX = 128
 @pytest.fixture(scope="module")
 def environment() -> Iterator[LiberoEnvironment]:
     made = LiberoEnvironment(SUITE, TASK, SimSettings(camera_px=PX))
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def stock(environment: LiberoEnvironment) -> Iterator[Any]:
+    """LIBERO's own environment of the same task; it takes seconds to make."""
+    from libero.libero.envs import OffScreenRenderEnv
+
+    made = OffScreenRenderEnv(bddl_file_name=environment.domain.bddl_file_name, camera_heights=PX, camera_widths=PX)
     yield made
     made.close()
 
@@ -68,11 +77,8 @@ def test_the_episode_starts_from_the_bundled_initial_state(environment: LiberoEn
     assert np.abs(moved).max() > 0.02  # the two states differ, so that a lost one would be seen
 
 
-def test_observations_equal_those_of_the_stock_environment(environment: LiberoEnvironment) -> None:
-    from libero.libero.envs import OffScreenRenderEnv
-
+def test_observations_equal_those_of_the_stock_environment(environment: LiberoEnvironment, stock: Any) -> None:
     settings = environment.settings
-    stock = OffScreenRenderEnv(bddl_file_name=environment.domain.bddl_file_name, camera_heights=PX, camera_widths=PX)
     stock.seed(settings.episode_seed(TASK, 3))
     stock.reset()
     obs = stock.set_init_state(environment.initial_states[3])
@@ -88,7 +94,6 @@ def test_observations_equal_those_of_the_stock_environment(environment: LiberoEn
         action = actions(11)[number]
         environment.step(action, look=number % 5 == 4)
         obs, *_ = stock.step(action.tolist())
-    stock.close()
 
 
 def test_pictures_are_upright_and_mirrored(environment: LiberoEnvironment) -> None:
@@ -116,20 +121,16 @@ def test_an_episode_is_the_same_whatever_ran_before(environment: LiberoEnvironme
         assert (one == other).all()
 
 
-def test_seeding_by_task_is_openpis() -> None:
-    from libero.libero.envs import OffScreenRenderEnv
-
+def test_seeding_by_task_is_openpis(stock: Any) -> None:
     mine = LiberoEnvironment(SUITE, TASK, SimSettings(camera_px=PX, seeding="task"))
     mine.reset(1)  # the resets of skipped episodes are made up for
     fixtures = np.array(mine.domain.sim.model.body_pos)
-    stock = OffScreenRenderEnv(bddl_file_name=mine.domain.bddl_file_name, camera_heights=64, camera_widths=64)
     stock.seed(7)
     for _ in range(2):
         stock.reset()
     assert (np.array(stock.sim.model.body_pos) == fixtures).all()
     mine.reset(0)
     assert (np.array(mine.domain.sim.model.body_pos) != fixtures).any()
-    stock.close()
     mine.close()
 
 
@@ -170,12 +171,12 @@ def test_actions_of_another_width_end_a_run_in_libero_and_what_was_finished_stay
     assert json.loads(results.path.read_text())["versions"]["simulator"]["mujoco"] == "3.2.3"
 
 
+@pytest.mark.usefixtures("two_layers")
 def test_the_command_runs_two_tasks_with_random_weights(tmp_path: Path) -> None:
     command = "eval libero --random-weights pi05_tiny --precision f32 --steps 2 --suite libero_spatial --tasks 0,1"
-    arguments = [*command.split(), "--trials", "1", "--max-steps", "20", "--out", str(tmp_path), "--json"]
-    code = "from turbopi.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    arguments = [*f"{command} --trials 1 --max-steps 6 --camera-px 64 --json".split(), "--out", str(tmp_path)]
+    done = turbopi(*arguments)
+    assert done.exit_code == 0, done.output
     reported = json.loads(done.stdout)
     assert reported["episodes"] == 2 and reported["success"]["trials"] == 2 and reported["crashes"] == 0
     assert len(list((tmp_path / "videos").iterdir())) == 2

@@ -213,11 +213,11 @@ class PolicyConfig:
     image_resize: ImageResize = "openpi"  # how images become 224 x 224: "openpi", "lerobot" or "lerobot_0.4"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
-    prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so
     num_denoising_steps: int = 10  # the default of a call; so are the next two
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
     real_time: RealTime = RealTime()
+    prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so
 
     @property
     def planned_model(self) -> ModelConfig:

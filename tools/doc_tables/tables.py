@@ -176,7 +176,7 @@ def ready(document: BenchDocument) -> list[str]:
     """Seconds from a program's start to its first answer, and the GPU memory that it then holds."""
     rows = []
     for one in document.ready or ():
-        for times, said in ((one.cold, "nothing kept"), (one.cached, "kernels kept")):
+        for times, said in ((one.cold, "nothing cached"), (one.cached, "kernels cached")):
             rows.append(
                 [
                     f"`{one.backend}` {one.precision}, {said}",

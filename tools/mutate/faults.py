@@ -343,7 +343,7 @@ FAULTS = (
         (BARRIERS,),
     ),
     Fault(
-        "every observation of a batch told what the first one asks for",
+        "every observation of a batch gets the first one's conditioning",
         "turbopi.engine",
         "array[row] if name in BY_ACTION else array[:, row] for",
         "array[0] if name in BY_ACTION else array[:, 0] for",

@@ -99,7 +99,8 @@ def test_throughput_compares_every_answer_bit_for_bit(wrong: float, equal: bool)
 
 
 def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
-    result = turbopi("study", "mask", "--random-weights", "pi05_tiny", "--device", "cpu", "--out", tmp_path, "--json")
+    tiny = ("--random-weights", "pi05_tiny", "--device", "cpu")
+    result = turbopi("study", "mask", "--small", *tiny, "--out", tmp_path, "--json")
     assert result.exit_code == 0, result.output
     (document,) = json.loads(result.stdout).values()
     file = tmp_path / "mask" / "report.json"

@@ -17,6 +17,7 @@ from turbopi.checkpoint.missing_files import (
 )
 from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
+from turbopi.checkpoint.packed import PACKED, unpacked
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
@@ -40,7 +41,7 @@ class Location:
 
     format: CheckpointFormat
     folder: Path  # what holds assets/, config.json and turbopi.json
-    weights: Path  # the folder of the safetensors files, or of the Orbax tree
+    weights: Path  # the folder of the safetensors files (the user's cache if they lay packed), or of the Orbax tree
     adapter: bool = False  # the weights are an adapter of the peft library
     notes: tuple[str, ...] = ()  # on other weights in the folder, which aren't read
 
@@ -62,10 +63,11 @@ def locate(path: str | Path) -> Location:
         return Location("onnx", folder, folder, notes=_notes(folder, "onnx"))
     params = folder / "params"
     if (folder / WEIGHTS).is_file() or ((folder / INDEX).is_file() and not params.is_dir()):  # openpi's own order
-        form: CheckpointFormat = "lerobot" if is_lerobot(folder) else "openpi_torch"
-        return Location(form, folder, folder, notes=_notes(folder, form))
+        return _of_tensors(folder, folder)
     if params.is_dir() and ((params / MANIFEST).is_file() or not (params / "params").is_dir()):
         return Location("openpi_jax", folder, params, notes=_notes(folder, "openpi_jax"))
+    if (folder / PACKED).is_file():
+        return _of_tensors(folder, unpacked(folder))
     raise CheckpointError(nothing_here(folder))
 
 
@@ -74,6 +76,11 @@ def tokenizer_candidates(folder: Path) -> list[Path]:
     patterns = ("*.model", "assets/*.model", "tokenizer/*.model", "big_vision/*.model", "tokenizer/tokenizer.json")
     found = [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
     return [file for file in found if not file.name.startswith(".")]
+
+
+def _of_tensors(folder: Path, weights: Path) -> Location:
+    form: CheckpointFormat = "lerobot" if is_lerobot(folder) else "openpi_torch"
+    return Location(form, folder, weights, notes=_notes(folder, form))
 
 
 def _local(path: str | Path) -> Path:

@@ -7,6 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 from turbopi.checkpoint.lerobot import is_lerobot
+from turbopi.checkpoint.packed import PACKED
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
 from turbopi.support.reading import files_below, listing
@@ -31,7 +32,7 @@ def unfinished_save(name: str) -> bool:
 def holds_weights(folder: Path) -> bool:
     """Whether something of a checkpoint lies right in the folder."""
     with suppress(OSError):
-        return (folder / WEIGHTS).is_file() or (folder / INDEX).is_file() or (folder / "params").is_dir()
+        return any((folder / name).is_file() for name in (WEIGHTS, INDEX, PACKED)) or (folder / "params").is_dir()
     return False
 
 

@@ -8,6 +8,7 @@
 Graphs, tables and kernels are made for a loop. Loops of a call and of a batch are made of their conditionings here.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -26,21 +27,21 @@ Table = int | tuple[float, ...]  # rows for so many of openpi's steps, or for th
 
 
 @dataclass(frozen=True)
-class Loop:
+class Loop(ABC):
     """What every loop has; the kinds are the classes below."""
 
     steps: int  # evaluations of the expert
     horizon: int
 
     @property
+    @abstractmethod
     def form(self) -> Form:
         """What it needs of a backend."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def table(self) -> Table:
         """The rows of its modulation table. Loops with the same ones share it."""
-        raise NotImplementedError
 
     @property
     def evaluations(self) -> "tuple[Loop, ...]":

@@ -1,4 +1,4 @@
-"""What comes with Turbo-Pi: images and statistics of LIBERO episodes, and a small trained policy."""
+"""What comes with Turbo-Pi: images and statistics of LIBERO episodes, and two small trained policies."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -31,10 +31,11 @@ class Frame:
     expert: np.ndarray | None = None
 
 
-FRAMES = Path(__file__).parents[1] / "data" / "libero"
-SMALL_POLICY = Path(__file__).parents[1] / "data" / "small_policy"  # trained; MODEL_CARD.md in it says how
-
-CHASE_POLICY = Path(__file__).parents[1] / "data" / "chase_policy"  # of the dynamic task, trained with simulated delays
+DATA = Path(__file__).parents[1] / "data"
+FRAMES = DATA / "libero"
+# Checkpoints' folders, with packed weights (checkpoint/packed.py). MODEL_CARD.md in them says how they were trained
+SMALL_POLICY = DATA / "small_policy"
+CHASE_POLICY = DATA / "chase_policy"  # of the dynamic task, trained with simulated delays
 
 
 def load_frames(folder: Path = FRAMES) -> list[Frame]:
