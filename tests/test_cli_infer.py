@@ -324,6 +324,5 @@ def test_actions_out_of_range_are_refused_if_so_requested(tmp_path: Path, monkey
     assert not (tmp_path / "actions.npz").exists()
     shown = " ".join(turbopi("infer", *options, "--out-of-range", "clip").output.split())
     assert "They were clipped" in shown
-    assert "unknown --out-of-range clamp; choose one of warn, refuse, clip" in refusal(
-        turbopi("infer", *options, "--out-of-range", "clamp")
-    )
+    message = refusal(turbopi("infer", *options, "--json", "--out-of-range", "clamp"), whole=False)
+    assert "unknown --out-of-range clamp; choose one of warn, refuse, clip" in message
