@@ -36,7 +36,7 @@ LAB = tempfile.TemporaryDirectory()  # turbopi-lab's entry points as this tree h
 install(Path(LAB.name), (ROOT / "packages/turbopi-lab/pyproject.toml").read_text(encoding="utf-8"))
 sys.path.insert(0, LAB.name)
 atexit.register(LAB.cleanup)
-SIX_LAYERS = PRESETS["pi05_tiny"].model
+SIX_LAYERS = PRESETS["pi05_tiny"].planned_model
 TWO_LAYERS = PRESETS["pi05_tiny"].with_model(
     vision=replace(SIX_LAYERS.vision, depth=2, image_size=56),  # 16 tokens a camera, of 256
     **{part: replace(getattr(SIX_LAYERS, part), depth=2) for part in ("vlm", "expert")},

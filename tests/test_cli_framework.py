@@ -34,6 +34,7 @@ COMMANDS = (
         "infer",
         "serve",
         "view",
+        "replay",
         "inspect",
         "convert",
         "calibrate",

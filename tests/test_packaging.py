@@ -103,7 +103,7 @@ def test_extras_end_at_what_was_tested(reported: Message) -> None:
     seen = set()
     for requirement in map(Requirement, reported.get_all("Requires-Dist", [])):
         extra = re.search(r'extra == "(\w+)"', str(requirement.marker or ""))
-        if extra is not None and extra[1] in ("cuda", "tensorrt", "onnx", "ray", "view"):
+        if extra is not None and extra[1] in ("cuda", "tensorrt", "onnx", "ray", "view", "replay"):
             assert {one.operator for one in requirement.specifier} & {"==", "<"}, requirement
             seen.add(extra[1])
-    assert len(seen) == 5
+    assert len(seen) == 6

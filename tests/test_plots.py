@@ -5,14 +5,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from PIL import Image
+from replay_data import EVERY, write_npz
 
 from turbopi.checkpoint.norm_stats import FeatureStats
 from turbopi.evaluate.plots import write_plots
 from turbopi.policy.ranges import DrawnRange, TrainingRange
+from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.robots.labels import Label
 from turbopi.support.action_groups import action_groups
 from turbopi.support.plots import SOLVED, Row, plot_chunks
@@ -133,3 +137,13 @@ def test_a_success_rate_of_zero_is_seen(drawn: list[Figure], tmp_path: Path) -> 
     ends = [line for line in success.get_lines() if line.get_marker() == "o"]
     assert [line.get_xydata().tolist() for line in ends] == [[[0, 0]], [[0, 1]]]  # type: ignore[union-attr]
     assert ends[0].get_color() == SOLVED and not any(line.get_clip_on() for line in ends)
+
+
+@pytest.mark.slow
+def test_the_plots_of_a_replay_are_drawn(tmp_path: Path) -> None:
+    report = tmp_path / "report"
+    quick = ("--device", "cpu", "--precision", "f32", "--steps", 1, "--changed", 0, "--every", EVERY)
+    ran = turbopi("replay", write_npz(tmp_path / "data"), SMALL_POLICY, *quick, "--report", report)
+    assert ran.exit_code == 0 and "The chunks follow the recorded actions" in ran.output
+    for name in ("by_index", "joints", "episode", "worst"):
+        assert np.asarray(Image.open(report / f"{name}.png")).std() > 5

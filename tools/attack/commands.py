@@ -44,6 +44,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "build": _TINY,
     "demo": (*_QUICK, "--frames", "1", "--episodes", "0", "--report", "{here}/report"),
     "view": ("{here}/nothing", "--save", "{here}/view.rrd"),
+    "replay": ("{here}/observation.npz", *_QUICK, "--changed", "0", "--every", "1", "--report", "{here}/replay"),
     "backends": (),
     "doctor": ("--port", "1"),
 }

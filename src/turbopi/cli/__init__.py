@@ -1,6 +1,6 @@
 """The command line.
 
-Run: demo, infer, serve, view. Checkpoint: inspect, convert, calibrate, verify. Measure: bench, eval, compare.
+Run: demo, infer, serve, view, replay. Checkpoint: inspect, convert, calibrate, verify. Measure: bench, eval, compare.
 Advanced: plan, export, build, tune, doctor. Old names, hidden for one version: backends (doctor).
 """
 
@@ -16,6 +16,7 @@ from turbopi.cli import (  # noqa: F401
     infer,
     serve,
     view,
+    replay,
     bench,
     plan,
     calibrate,

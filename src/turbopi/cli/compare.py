@@ -13,6 +13,7 @@ from turbopi.cli.evaluate import EvalOptions, run_with_progress
 from turbopi.cli.evaluate_options import COMMON_EVAL
 from turbopi.cli.files import check_report
 from turbopi.cli.framework import JsonFlag, Output, command
+from turbopi.cli.options import PolicyOptions
 from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -174,11 +175,16 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
         calibration_of(options.policy_arguments()["quantization"], tier, checkpoint)
 
 
-def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None]:
+def parse_variant(text: str, options: PolicyOptions) -> tuple[str, str, int | None]:
     """ "pytorch:bf16:5"; what is left out is --precision's and --steps', steps then None for the checkpoint's.
 
     Raises ConfigError for anything else.
     """
+    return way_to_run(text, options, "the folder of an evaluation")
+
+
+def way_to_run(text: str, options: PolicyOptions, other: str) -> tuple[str, str, int | None]:
+    """`parse_variant` where `other` is what the text could have been instead."""
     from turbopi import backends
 
     parts = text.split(":")
@@ -187,7 +193,7 @@ def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None
     known = backend in backends.known() and precision in backends.PRECISIONS
     if not known or len(parts) > 3 or not all(re.fullmatch("[0-9]{1,9}", steps) for steps in parts[2:]):
         raise ConfigError(
-            f"{text!r} is neither the folder of an evaluation nor a way to run: BACKEND[:PRECISION[:STEPS]], "
+            f"{text!r} is neither {other} nor a way to run: BACKEND[:PRECISION[:STEPS]], "
             f"with a backend of {', '.join(backends.known())}, and {' or '.join(backends.PRECISIONS)}"
         )
     return backend, precision, int(parts[2]) if len(parts) > 2 else options.steps

@@ -49,10 +49,10 @@ def known_groups(robot: str) -> list[ActionGroup]:
     return _GROUPS.get(robot, [])
 
 
-def action_groups(robot: str, dims: int, names: Sequence[str] = ()) -> list[ActionGroup]:
+def action_groups(robot: str, dims: int, names: Sequence[str] | None = None) -> list[ActionGroup]:
     """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible.
 
-    names  of an unknown robot's actions, as far as there are any
+    names   of an unknown robot's actions, where a dataset has them
     """
     groups = known_groups(robot)
     if sum(len(group.names) for group in groups) == dims:
@@ -62,7 +62,7 @@ def action_groups(robot: str, dims: int, names: Sequence[str] = ()) -> list[Acti
         ActionGroup(
             f"actions {eight[0]} to {eight[-1]}",
             "the robot's units",
-            {index: names[index] if index < len(names) else f"dim {index}" for index in eight},
+            {index: names[index] if names is not None and len(names) == dims else f"dim {index}" for index in eight},
         )
         for eight in eights
     ]

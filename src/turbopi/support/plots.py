@@ -37,6 +37,7 @@ class Range(Protocol):
 class Row:
     """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines.
 
+    legend   what those two are called
     state  of the robot, float[s]
     """
 
@@ -46,6 +47,7 @@ class Row:
     oracle: np.ndarray | None = None
     expert: np.ndarray | None = None
     state: np.ndarray | None = None
+    legend: tuple[str, str] = ("float32 reference", "expert")
 
 
 def plot_chunks(
@@ -55,15 +57,17 @@ def plot_chunks(
     robot: str,
     title: str,
     random_weights: bool,
+    names: Sequence[str] | None = None,
     state_range: Range | None = None,
     action_range: Range | None = None,
 ) -> None:
     """Write a PNG with one row an observation: its images, its state, then its action chunk by groups of one unit.
 
     A group's axis is the same in every row. The state is drawn where its training range is known; that of an action is
-    a bar behind the last step. Raises as `write_figure` does.
+    a bar behind the last step; `names` as for `action_groups`. Raises as `write_figure` does.
     """
-    names = () if action_range is None else [name for name, _ in action_range.labels]
+    if names is None and action_range is not None:
+        names = [name for name, _ in action_range.labels]
     groups = action_groups(robot, rows[0].actions.shape[1], names)
     num_images = max(len(row.camera_images) for row in rows)
     limits = [_limits(group, rows) for group in groups]
@@ -166,15 +170,15 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row, known: Range | None) -> 
             behind = len(steps) + 0.02 * len(steps) * (number + 1)
             ax.plot([behind] * 2, [known.low[index], known.high[index]], color=color, linewidth=3, alpha=0.5)
         if row.oracle is not None:
-            ax.plot(steps, row.oracle[:, index], color=color, **dot)
+            ax.plot(steps[: len(row.oracle)], row.oracle[: len(steps), index], color=color, **dot)
         if row.expert is not None:
             ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=color, **broken)
     if row.oracle is not None:
         handles.append(
-            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="float32 reference")
+            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label=row.legend[0])
         )
     if row.expert is not None:
-        handles.append(Line2D([], [], color="0.3", label="expert", **broken))
+        handles.append(Line2D([], [], color="0.3", label=row.legend[1], **broken))
     ax.set_title(group.title, fontsize=9)
     ax.set_xlabel("step of the chunk", fontsize=8)
     ax.set_ylabel(group.unit, fontsize=8)

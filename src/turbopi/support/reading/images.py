@@ -26,21 +26,21 @@ def read_image(file: str | Path) -> np.ndarray:
         return decode_image(stream, file)
 
 
-def decode_image(stream: IO[bytes], file: str | Path) -> np.ndarray:
-    """The image in an open file, as `read_image`; `file` is its name in errors."""
+def decode_image(stream: IO[bytes], name: object) -> np.ndarray:
+    """The image in an open file, as `read_image`; `name` begins the messages."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # refused below
             image = Image.open(stream, formats=IMAGE_FORMATS)
         if image.width * image.height > MAX_PIXELS:
-            raise ObservationError(f"{file} has {image.width} x {image.height} pixels; at most {MAX_PIXELS} are read")
+            raise ObservationError(f"{name} has {image.width} x {image.height} pixels; at most {MAX_PIXELS} are read")
         if image.mode not in _MODES:
-            raise ObservationError(f"{file} has pixels of mode {image.mode}; expected 8 bits a channel, such as RGB")
+            raise ObservationError(f"{name} has pixels of mode {image.mode}; expected 8 bits a channel, such as RGB")
         return np.array(image.convert("RGB"))
     except ObservationError:
         raise
     except Exception as reason:  # damage makes Pillow's decoders raise a dozen classes
         why = " ".join(str(reason).split())[:200].replace(repr(stream), "it")
         raise ObservationError(
-            f"{file} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(IMAGE_FORMATS)
+            f"{name} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(IMAGE_FORMATS)
         ) from reason

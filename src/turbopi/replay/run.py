@@ -1,0 +1,332 @@
+"""Which moments are taken, and what a policy does with each of them."""
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.preprocess.normalize import Normalizer
+from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
+from turbopi.replay.keys import KeyMap, join_keys
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
+from turbopi.verify.demo import action_units
+
+SECONDS = 60.0  # that a run takes, unless --every says how many moments
+LEAST, MOST = 24, 4096  # moments, whatever the time
+OF_AN_EPISODE = 8  # moments at least, before episodes are left out
+BATCH = 8
+CHANGED = 12  # moments at which inputs are also changed on purpose
+
+
+@dataclass(frozen=True)
+class Variation:
+    """A mistake in the inputs, made on purpose: what it is, and the observation with it."""
+
+    name: str
+    change: Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A policy over the moments, N of them.
+
+    about        its metadata
+    keys         how the dataset's keys were read
+    moments      (episode, step) of each
+    predicted    float64[N, H, d]  in the robot's units
+    recorded     float64[N, H, d]  NaN behind an episode's end
+    previous     float64[N, d]     the action before; NaN where there is none
+    units        float64[d]        how far each action moves with one unit of the model's normalised actions
+    middle       float64[N, d]     the action that a normalised 0 is, which depends on the state for relative actions
+    states       float64[N, s]     as the model reads them, before normalisation
+    state_scale  what normalises those
+    reach        how many units beside the middle hold nearly all of the training's actions
+    call_ms      of each call of the policy, a batch's counted once
+    variations   {name: float64[n, H, d]}, the chunks of `changed`, indices of moments
+    """
+
+    about: Mapping[str, Any]
+    keys: KeyMap
+    moments: Sequence[tuple[Episode, int]]
+    predicted: np.ndarray
+    recorded: np.ndarray
+    previous: np.ndarray
+    units: np.ndarray
+    middle: np.ndarray
+    states: np.ndarray
+    state_scale: Normalizer
+    reach: float
+    call_ms: Sequence[float]
+    changed: Sequence[int]
+    variations: Mapping[str, np.ndarray]
+
+    @property
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """(predicted, recorded) from the middle on: for relative actions the motion from the state. The state itself is
+        in what any such policy predicts, so it would make a chunk of nonsense look near.
+        """
+        return self.predicted - self.middle[:, None], self.recorded - self.middle[:, None]
+
+
+def reach_of(scale: Normalizer) -> float:
+    """1 where the statistics are a range; by z-score the normal distribution's 1 % and 99 % quantiles."""
+    return 2.326 if scale.mode.endswith("zscore") else 1.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run is given besides policy and dataset: see `turbopi replay --help`."""
+
+    renames: Mapping[str, str]
+    task: str | None = None
+    seed: int = 0
+    changed: int = CHANGED
+
+
+# --- which moments ----------------------------------------------------------------------------------------------------
+
+
+def chosen_episodes(dataset: Dataset, wanted: Sequence[int] | None) -> tuple[Episode, ...]:
+    """The episodes of these numbers, or all. Raises ConfigError for a number that isn't there."""
+    if wanted is None:
+        return tuple(dataset.episodes)
+    by_number = {episode.number: episode for episode in dataset.episodes}
+    missing = [number for number in wanted if number not in by_number]
+    if missing:
+        raise ConfigError(
+            f"--episodes: there is no episode {missing[0]}; {dataset.path} has {len(by_number)}, from {min(by_number)} "
+            f"to {max(by_number)}"
+        )
+    return tuple(by_number[number] for number in dict.fromkeys(wanted))
+
+
+def select(episodes: Sequence[Episode], every: int | None, affordable: int) -> Selection:
+    """Moments spread evenly: every `every`-th, or about as many as are affordable.
+
+    If that would be less than OF_AN_EPISODE an episode, evenly chosen episodes are taken instead of all.
+    """
+    total, there = sum(episode.length for episode in episodes), len(episodes)
+    chosen = tuple(episodes)
+    if every is None:
+        most = max(1, affordable // OF_AN_EPISODE)
+        if there > most:
+            chosen = tuple(episodes[int(i)] for i in np.linspace(0, there - 1, most).round())
+        every = max(1, -(-sum(episode.length for episode in chosen) // affordable))
+    return Selection(chosen, every, there, total)
+
+
+def affordable(seconds: float, changes: int) -> int:
+    """How many moments fit into SECONDS, if one takes so many, and `changes` more calls are made on purpose."""
+    return int(np.clip(SECONDS / max(seconds, 1e-6) - changes, LEAST, MOST))
+
+
+# --- a policy ---------------------------------------------------------------------------------------------------------
+
+
+class Replay:
+    """A policy that is to go over a dataset: keys joined, warmed up.
+
+    Raises ConfigError or ObservationError if they don't fit each other.
+    """
+
+    def __init__(
+        self, policy: UnifiedPolicy, dataset: Dataset, episodes: Sequence[Episode], settings: Settings
+    ) -> None:
+        self.policy, self.dataset, self.settings = policy, dataset, settings
+        self.horizon = policy.config.model.action_horizon
+        dataset.wanted = None
+        self._first = self._read_first(episodes[0])
+        self.keys = join_keys(policy, self._first.observation, settings.renames, settings.task)
+        dataset.wanted = frozenset(self.keys.joined.values())
+        self.width = self._check_width(self._first.recorded.shape[1])
+        self.variations = variations_of(self.keys) if settings.changed else []
+
+    def _read_first(self, episode: Episode) -> Moment:
+        begin = time.perf_counter()
+        (moment,) = self.dataset.moments(episode, [0], self.horizon)
+        self._reading = time.perf_counter() - begin
+        return moment
+
+    def _check_width(self, recorded: int) -> int:
+        """How many actions a step are compared. Raises ConfigError."""
+        about = self.policy.metadata
+        width = int(about["robot_action_dim"])
+        if recorded < width and about["robot"] == "plain":  # which has all of the model's, padding among them
+            return recorded
+        if recorded != width:
+            names = f" ({', '.join(self.dataset.action_names)})" if self.dataset.action_names else ""
+            raise ConfigError(
+                f"the dataset has {recorded} actions a step{names}, but robot {about['robot']} has {width}. Is this "
+                "the checkpoint's robot (--robot)? If the dataset has several kinds of actions, say which: --rename "
+                "KEY=actions"
+            )
+        return width
+
+    @property
+    def notes(self) -> list[str]:
+        """Keys that one side has and the other doesn't."""
+        found = []
+        if self.keys.absent:
+            unread = f"; cameras of it that aren't read: {', '.join(self.keys.unread)}" if self.keys.unread else ""
+            found.append(
+                f"the dataset has nothing called {', '.join(self.keys.absent)}, which the policy does without{unread}. "
+                "--rename says which is which"
+            )
+        elif self.keys.unread:
+            found.append(f"cameras of the dataset that the policy doesn't read: {', '.join(self.keys.unread)}")
+        return found
+
+    def warm_up(self) -> float:
+        """Warm up, and return the seconds that a moment takes, reading included."""
+        self.policy.warmup(batches=BATCH if self.policy.runs_batches else None)
+        observation = self._observation(self._first)
+        rows = BATCH if self.policy.runs_batches else 1
+        begin = time.perf_counter()
+        self._infer([observation] * rows, [self.settings.seed] * rows)
+        return (time.perf_counter() - begin) / rows + self._reading
+
+    @property
+    def changes(self) -> int:
+        """Calls besides those at the moments, at most."""
+        return self.settings.changed * len(self.variations)
+
+    def run(self, selection: Selection, advance: Callable[[], None]) -> Replayed:
+        """Every moment of the selection, each with its own noise: the seed's, the seed + 1's, …"""
+        count = selection.count
+        changed = sorted({int(i) for i in np.linspace(0, count - 1, min(self.settings.changed, count)).round()})
+        found: list[_Answer] = []
+        varied: dict[str, list[np.ndarray]] = {variation.name: [] for variation in self.variations}
+        batches = _batches(self._moments(selection), BATCH if self.policy.runs_batches else 1)
+        call_ms = []
+        for batch in batches:
+            observations = [self._observation(moment) for moment in batch]
+            seeds = [self.settings.seed + len(found) + row for row in range(len(batch))]
+            with self._naming(batch):
+                begin = time.perf_counter()
+                chunks = self._infer(observations, seeds)
+                call_ms.append((time.perf_counter() - begin) * 1e3)
+                for moment, observation, chunk, seed in zip(batch, observations, chunks, seeds, strict=True):
+                    if len(found) in changed:
+                        for variation in self.variations:
+                            varied[variation.name] += self._infer([variation.change(observation)], [seed])
+                    found.append(self._answer(moment, observation, chunk))
+                    advance()
+        return Replayed(
+            self.policy.metadata,
+            self.keys,
+            [one.at for one in found],
+            np.stack([one.chunk for one in found]),
+            np.stack([one.recorded for one in found]),
+            np.stack([one.previous for one in found]),
+            action_units(self.policy, self._observation(self._first))[: self.width],
+            np.stack([one.middle for one in found]),
+            np.stack([one.state for one in found]),
+            self.policy.pipeline.state_scale,
+            reach_of(self.policy.pipeline.action_scale),
+            call_ms,
+            changed,
+            {name: np.stack(chunks) for name, chunks in varied.items() if chunks},
+        )
+
+    def observation_at(self, episode: Episode, step: int) -> dict[str, Any]:
+        """One moment's observation under the robot's keys, to be looked at."""
+        (moment,) = self.dataset.moments(episode, [step], self.horizon)
+        return self._observation(moment)
+
+    @contextmanager
+    def _naming(self, batch: Sequence[Moment]) -> Iterator[None]:
+        """What the policy can't use is named with where it is."""
+        try:
+            yield
+        except (ObservationError, ActionError) as error:
+            first, more = batch[0], f" and the {len(batch) - 1} after it" if len(batch) > 1 else ""
+            where = f"{self.dataset.path}: episode {first.episode.name}, step {first.step}{more}"
+            raise type(error)(f"{where}: {error}") from error
+
+    def _moments(self, selection: Selection) -> Iterator[Moment]:
+        for episode in selection.episodes:
+            yield from self.dataset.moments(episode, selection.steps(episode), self.horizon)
+
+    def _observation(self, moment: Moment) -> dict[str, Any]:
+        return self.keys.observation(moment.observation, self.settings.task)
+
+    def _infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[np.ndarray]:
+        if len(observations) == 1:
+            results = [self.policy.infer(observations[0], seed=seeds[0])]
+        else:
+            results = self.policy.infer_batch(observations, seed=seeds)
+        return [result["actions"][:, : self.width] for result in results]
+
+    def _answer(self, moment: Moment, observation: Mapping[str, Any], chunk: np.ndarray) -> "_Answer":
+        pipeline, model = self.policy.pipeline, self.policy.config.model
+        one = pipeline.see(observation, resize=False)
+        pipeline.read(one)
+        zeros = np.zeros((model.action_horizon, model.action_dim), np.float32)
+        middle = pipeline.after(zeros, one.state)["actions"][0, : self.width]
+        return _Answer(
+            (moment.episode, moment.step),
+            self._padded(moment.recorded),
+            self._before(moment),
+            chunk,
+            middle,
+            np.array(one.robot.state, np.float64),
+        )
+
+    def _padded(self, recorded: np.ndarray) -> np.ndarray:
+        if recorded.shape[1] < self.width:
+            raise ObservationError(f"{self.dataset.path}: an episode has {recorded.shape[1]} actions, not {self.width}")
+        padded = np.full((self.horizon, self.width), np.nan)
+        padded[: len(recorded)] = recorded[:, : self.width]
+        return padded
+
+    def _before(self, moment: Moment) -> np.ndarray:
+        return np.full(self.width, np.nan) if moment.previous is None else moment.previous[: self.width]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What is kept of a moment: not its images."""
+
+    at: tuple[Episode, int]
+    recorded: np.ndarray
+    previous: np.ndarray
+    chunk: np.ndarray
+    middle: np.ndarray
+    state: np.ndarray
+
+
+def _batches(moments: Iterator[Moment], size: int) -> Iterator[list[Moment]]:
+    while batch := list(itertools.islice(moments, size)):
+        yield batch
+
+
+def variations_of(keys: KeyMap) -> list[Variation]:
+    """Mistakes that are easily made with cameras: exchanged, BGR for RGB, turned."""
+
+    def of_all(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+        """`change` of every image, as [h, w, 3]."""
+
+        def changed(observation: Mapping[str, Any]) -> dict[str, Any]:
+            images = {}
+            for key in keys.cameras:
+                first = observation[key].shape[-1] != 3
+                image = observation[key].transpose(1, 2, 0) if first else observation[key]
+                image = change(image)
+                images[key] = np.ascontiguousarray(image.transpose(2, 0, 1) if first else image)
+            return {**observation, **images}
+
+        return changed
+
+    def exchanged(one: str, other: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+        return lambda observation: {**observation, one: observation[other], other: observation[one]}
+
+    found = [Variation(f"{a} and {b} exchanged", exchanged(a, b)) for a, b in itertools.combinations(keys.cameras, 2)]
+    if keys.cameras:
+        found.append(Variation("red and blue exchanged", of_all(lambda image: image[..., ::-1])))
+        found.append(Variation("images turned by 180 degrees", of_all(lambda image: image[::-1, ::-1])))
+    return found
