@@ -64,8 +64,8 @@ def test_the_state_is_drawn_in_its_training_range_and_actions_beside_theirs(
     state = TrainingRange(FeatureStats(q01=np.array([0.0, 1.0]), q99=np.array([10.0, 1.0])), [Label("hip"), Label("b")])
     actions = DrawnRange((Label("left"), Label("right")), np.array([-3.0, np.nan]), np.array([2.0, np.nan]))
     rows = [Row("a row", {}, np.zeros((10, 2)), state=np.array([45.0, 1.0]))]
-    more = {"state_range": state.drawn, "action_range": actions}
-    plot_chunks(tmp_path / "chunks.png", rows, robot="mine", title="title", random_weights=False, **more)
+    ranges: dict[str, Any] = {"state_range": state.drawn, "action_range": actions}
+    plot_chunks(tmp_path / "chunks.png", rows, robot="mine", title="title", random_weights=False, **ranges)
     in_range, chunk = drawn[-1].subfigs[0].axes
     assert [label.get_text() for label in in_range.get_yticklabels()] == ["hip  45", "b  1"]
     assert [np.asarray(line.get_xdata()).tolist() for line in in_range.get_lines()] == [[2], [0.5]]  # far; constant

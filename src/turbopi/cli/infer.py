@@ -306,7 +306,7 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
     output.line(STAGES, "dim")
 
 
-def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: dict[str, "DrawnRange"]) -> None:
+def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: "tuple[DrawnRange, DrawnRange]") -> None:
     from turbopi.support.action_groups import images_of
     from turbopi.support.plots import Row, plot_chunks
 
@@ -324,7 +324,15 @@ def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: d
     title = f"{about['config']}, {about['backend']} {about['precision']} on {about['device_name']}"
     if len(rows) < len(answers):
         title += f": the first {len(rows)} of {len(answers)} calls"
-    plot_chunks(file, rows, robot=about["robot"], title=title, random_weights=about["random_weights"], **ranges)
+    plot_chunks(
+        file,
+        rows,
+        robot=about["robot"],
+        title=title,
+        random_weights=about["random_weights"],
+        state_range=ranges[0],
+        action_range=ranges[1],
+    )
 
 
 def _prompt(observation: dict[str, Any], about: dict[str, Any]) -> str:

@@ -49,10 +49,10 @@ class Checks:
         self._labels: dict[tuple[str, ...], list[str]] = {}  # of cameras
 
     @property
-    def drawn(self) -> dict[str, DrawnRange]:
+    def drawn(self) -> tuple[DrawnRange, DrawnRange]:
         """For plots: the ranges of state and actions, empty ones where the statistics are made up."""
         actions = self.actions.drawn_of_actions(self._robot, self._pipeline.config.model.action_dim)
-        return {"state_range": self.state.drawn, "action_range": actions}
+        return self.state.drawn, actions
 
     def _normalized(self, ends: np.ndarray) -> np.ndarray:
         """float64[d], of actions, as the model has them: float32[d]."""
