@@ -344,7 +344,9 @@ def test_info_describes_a_checkpoint_in_plain_json(tmp_path: Path, pi05: Checkpo
     assert sum(parts.values()) == info["parameters"]["total"] == sum(int(np.prod(shape)) for shape in shapes.values())
     assert parts["vision"] == sum(int(np.prod(s)) for name, s in shapes.items() if name.startswith("vision."))
     assert info["stored_bytes"] == 4 * info["parameters"]["total"]
-    assert info["norm_stats"]["state"] == {"dim": 8, "statistics": ["mean", "std", "q01", "q99"]}
+    state = info["norm_stats"]["state"]
+    assert (state["dim"], state["statistics"]) == (8, ["mean", "std", "q01", "q99"])
+    assert all(len(state["values"][name]) == 8 for name in state["statistics"])
     assert (info["robot"], info["action_horizon"], info["asset_id"]) == ("libero", 10, LIBERO)
     folder = torch_copy(tmp_path / "copy")
     (folder / "assets" / "paligemma_tokenizer.model").write_bytes(b"x")

@@ -1,11 +1,14 @@
 """Random weights: the same from the same seed, of sensible scale, and never mistaken for trained ones."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from turbopi.checkpoint import Checkpoint, random_checkpoint
+from turbopi.checkpoint import Checkpoint, open_checkpoint, random_checkpoint
+from turbopi.checkpoint.convert import write_random
 from turbopi.checkpoint.random_weights import _BLOCK, _fill
 from turbopi.config import PRESETS
 from turbopi.models import parameter_shapes
@@ -103,6 +106,19 @@ def test_fingerprints_tell_seeds_and_sizes_apart(tiny: Checkpoint) -> None:
     assert tiny.fingerprint() == random_checkpoint(SMALL, 0).fingerprint()
     assert tiny.fingerprint() != random_checkpoint(SMALL, 1).fingerprint()
     assert tiny.fingerprint() != random_checkpoint(SMALL.with_model(vocab_size=512)).fingerprint()
+
+
+def test_the_short_hash_is_made_at_once_only_of_small_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_random(SMALL, tmp_path / "small")
+    for file in folder.rglob("*"):
+        os.utime(file, (1.0, 1.0))  # settled, so that hashes are remembered
+    with monkeypatch.context() as large:
+        large.setattr("turbopi.checkpoint.base.SMALL_BYTES", 0)
+        assert open_checkpoint(folder).short_hash is None
+        whole = open_checkpoint(folder).fingerprint()
+        assert open_checkpoint(folder).short_hash == whole[:12]
+    os.utime(folder / "model.safetensors", (2.0, 2.0))
+    assert open_checkpoint(folder).short_hash == whole[:12]
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 1.0, True, "0"])

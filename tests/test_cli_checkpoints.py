@@ -12,7 +12,7 @@ from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.policy.shipped import FRAMES, load_frames
+from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 
 ARM = {
     "name": "my_arm",
@@ -53,6 +53,38 @@ def test_inspect_shows_what_the_folder_holds(tiny: Path) -> None:
         "total 5,672,480",
     ):
         assert fact in shown.replace("┃", " ").replace("  ", " "), fact
+
+
+def test_inspect_shows_the_statistics_by_joint_with_units(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = turbopi("inspect", SMALL_POLICY).stdout
+    assert max(map(len, shown.splitlines())) <= 80
+    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in shown.splitlines()]
+    assert ["axis-angle x", "rad", "2.187", "3.166", "2.839", "0.4209"] in rows
+    assert ["gripper", "−1 open, 1 closed", "-1", "1", "0.1608", "0.987"] in rows
+    document = json.loads(turbopi("inspect", SMALL_POLICY, "--json").stdout)
+    q01 = document["norm_stats"]["state"]["values"]["q01"]
+    assert q01 == pytest.approx(open_checkpoint(SMALL_POLICY).norm_stats.state.q01.tolist())  # type: ignore[union-attr]
+    assert document["labels"]["state"][3] == {"name": "axis-angle x", "unit": "rad"}
+    robot = tiny.parent / "arm.json"
+    robot.write_text(json.dumps(ARM | {"state": {"joints": 5, "grip": 1}}))
+    shown = turbopi("inspect", tiny, "--robot", robot).stdout
+    assert "joints[4]" in shown and "grip " in shown and "action 5" in shown and "unit" not in shown
+
+
+def test_random_weights_that_were_converted_say_so_in_every_command(tiny: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    result = turbopi("convert", tiny, again, "--precision", "f32", "--json")
+    assert "RANDOM WEIGHTS (seed 4): the actions mean nothing." in result.stderr
+    document = json.loads(result.stdout)
+    opened = open_checkpoint(again)
+    assert document["random_weights"] is True and document["checkpoint_path"] == str(tiny)
+    assert document["weights"] == open_checkpoint(tiny).fingerprint()[:12]
+    assert opened.random == "seed 4" and opened.info()["random_weights"] is True
+    assert "note: random weights, seed 4: actions mean nothing" in turbopi("inspect", again).stdout
+    (tmp_path / "own.json").write_text('{"preset": "pi05_libero", "vision_heads": 4}')
+    assert open_checkpoint(again, config=tmp_path / "own.json").random == "seed 4"  # whatever turbopi.json is read
+    assert open_checkpoint(SMALL_POLICY).random is None
 
 
 def test_inspect_json_is_the_checkpoints_own_description(tiny: Path) -> None:

@@ -306,5 +306,23 @@ def test_a_state_in_other_units_than_the_training_datas_is_doubted(tmp_path: Pat
     np.savez(file, **seen)
     assert "note" not in turbopi("infer", *options).output
     np.savez(file, **seen | {"observation/state": np.degrees(seen["observation/state"])})
-    shown = " ".join(turbopi("infer", *options).output.split())
-    assert re.search(r"note: .*degrees.npz: the state is far .*: value \d is .*, in the training data .* units", shown)
+    result = turbopi("infer", *options, "--json")
+    shown = " ".join(result.stderr.split())
+    assert shown.count("degrees.npz: the state is far") == 1
+    assert re.search(r"note: .*degrees.npz: the state is far .*: x is .*, in the training data .* units", shown)
+    ((note,),) = json.loads(result.stdout)["notes"]
+    assert note["kind"] == "state_range" and note["names"][0] == "x"
+
+
+def test_actions_out_of_range_are_refused_if_so_requested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("turbopi.policy.ranges.FAR", -0.49)  # all but the middle of the training range is far outside
+    file = tmp_path / "observation.npz"
+    np.savez(file, **observation())
+    options = (SMALL_POLICY, file, "--steps", 1, "--no-warmup", "--no-plot", "-o", tmp_path / "actions.npz")
+    message = refusal(turbopi("infer", *options, "--json", "--out-of-range", "refuse"), whole=False)
+    assert re.search(r"\w+ reaches \S+ at step \d+, in the training data \S+ to \S+", message)
+    assert not (tmp_path / "actions.npz").exists()
+    shown = " ".join(turbopi("infer", *options, "--out-of-range", "clip").output.split())
+    assert "They were clipped" in shown
+    message = refusal(turbopi("infer", *options, "--json", "--out-of-range", "clamp"), whole=False)
+    assert "unknown --out-of-range clamp; choose one of warn, refuse, clip" in message

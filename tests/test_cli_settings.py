@@ -29,7 +29,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         seen["options"] = wanted
 
     monkeypatch.setattr("turbopi.serve.run", run)
-    monkeypatch.setattr(command.PolicyOptions, "make_policy", lambda self, *_, **__: seen.update(policy=self))
+    monkeypatch.setattr(command.ActingOptions, "make_policy", lambda self, *_, **__: seen.update(policy=self))
     return seen
 
 

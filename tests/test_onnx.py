@@ -542,6 +542,7 @@ def test_random_weights_are_exported_with_a_warning(tmp_path: Path, monkeypatch:
     beside = {"turbopi.json", "tokenizer.model", "assets"}
     names = {"prompt.onnx", "prompt.onnx.data", MANIFEST}
     assert {file.name for file in (tmp_path / "tiny").iterdir()} == names | beside
+    assert json.loads((tmp_path / "tiny" / MANIFEST).read_text())["random_weights"] == "seed 0"
 
 
 def test_the_command_refuses_before_it_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,8 +13,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 from replay_data import EVERY, write_npz
 
+from turbopi.checkpoint.norm_stats import FeatureStats
 from turbopi.evaluate.plots import write_plots
+from turbopi.policy.ranges import DrawnRange, TrainingRange
 from turbopi.policy.shipped import SMALL_POLICY
+from turbopi.robots.labels import Label
 from turbopi.support.action_groups import action_groups
 from turbopi.support.plots import SOLVED, Row, plot_chunks
 
@@ -53,6 +56,22 @@ def test_noise_looks_small_and_every_row_has_the_same_axis(
             if group.limits is not None:
                 assert low < group.limits[0] and group.limits[1] < high
                 assert high - low < 1.2 * (group.limits[1] - group.limits[0])
+
+
+def test_the_state_is_drawn_in_its_training_range_and_actions_beside_theirs(
+    drawn: list[Figure], tmp_path: Path
+) -> None:
+    state = TrainingRange(FeatureStats(q01=np.array([0.0, 1.0]), q99=np.array([10.0, 1.0])), [Label("hip"), Label("b")])
+    actions = DrawnRange((Label("left"), Label("right")), np.array([-3.0, np.nan]), np.array([2.0, np.nan]))
+    rows = [Row("a row", {}, np.zeros((10, 2)), state=np.array([45.0, 1.0]))]
+    ranges: dict[str, Any] = {"state_range": state.drawn, "action_range": actions}
+    plot_chunks(tmp_path / "chunks.png", rows, robot="mine", title="title", random_weights=False, **ranges)
+    in_range, chunk = drawn[-1].subfigs[0].axes
+    assert [label.get_text() for label in in_range.get_yticklabels()] == ["hip  45", "b  1"]
+    assert [np.asarray(line.get_xdata()).tolist() for line in in_range.get_lines()] == [[2], [0.5]]  # far; constant
+    assert [-3.0, 2.0] in [np.asarray(line.get_ydata()).tolist() for line in chunk.get_lines()]
+    legend = chunk.get_legend()
+    assert legend is not None and [text.get_text() for text in legend.get_texts()] == ["left", "right"]
 
 
 def test_known_units_have_fixed_axes() -> None:

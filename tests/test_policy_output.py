@@ -99,8 +99,7 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
     for module in ("policy", "model_call"):
         monkeypatch.setattr(f"turbopi.policy.{module}.time", SimpleNamespace(perf_counter=clock))
     pipeline = policy.pipeline
-    first = "see" if kind == "begin" else "before"
-    monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))
+    monkeypatch.setattr(pipeline, "see", clock.passes(0.5, pipeline.see))
     monkeypatch.setattr(pipeline, "after_all", clock.passes(0.25, pipeline.after_all))
 
     class Lock:

@@ -163,21 +163,3 @@ def test_relative_and_absolute_actions_are_openpis_exactly(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in PAD.files if "/out/" in name])
 def test_padding_is_openpis_exactly(name: str) -> None:
     np.testing.assert_array_equal(pad_last(PAD[name.replace("/out/", "/in/")], 32), PAD[name], strict=True)
-
-
-@pytest.mark.parametrize(
-    ("mode", "low", "high", "limits"),
-    [
-        ("quantile", "q01", "q99", (-2, 2)),
-        ("lerobot_quantile", "q01", "q99", (-2, 2)),
-        ("lerobot_min_max", "min", "max", (-2, 2)),
-        ("zscore", "mean", "std", (-12, 8)),
-    ],
-)
-def test_degrees_are_far_from_statistics_in_radians(mode: NormMode, low: str, high: str, limits: Any) -> None:
-    """The third dimension was constant, the fourth has no statistics: neither is far from anything."""
-    stats = FeatureStats(**{low: np.array([-2.0, -2.0, 0.0]), high: np.array([2.0, 2.0, 0.0])})
-    scale = Normalizer(mode, stats, "state")
-    assert scale.far_outside(np.array([1.5, -9.0, 100.0, 100.0])) == []
-    assert scale.far_outside(np.array([90.0, -145.0, 100.0, 100.0])) == [(0, *limits), (1, *limits)]
-    assert Normalizer("identity", None, "state").far_outside(np.array([1e9])) == []

@@ -23,6 +23,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
 import turbopi.serve.page
+from turbopi.policy.watch import Reading, Sample
 from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import PolicyServer, ServerOptions
 from turbopi.serve.metrics import Metrics
@@ -303,6 +304,35 @@ def test_the_feed_tells_what_went_wrong() -> None:
             assert "illegal memory access" in str((await frame(watcher, lambda frame: frame.lost)).lost)
 
     served(test)
+
+
+def test_the_feed_has_the_notes_of_each_robots_last_answer_and_the_log_of_them() -> None:
+    class Noting(Robotic):
+        gives_readings = True
+
+        def infer(self, obs: dict[str, Any], readings: bool = False) -> dict[str, Any]:
+            assert readings
+            black = obs["prompt"] == "black"
+            return super().infer(obs) | {
+                "reading": Reading([0.0], images={"front": Sample((2, 2), bytes(12))} if black else {})
+            }
+
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher, robot(server) as connection, robot(server) as other:
+            await ask(connection, "black")
+            await ask(other, "bright")
+            one, two = (await frame(watcher, lambda frame: [one.calls for one in frame.robots] == [1, 1])).robots
+            assert one.notes == ["camera front is black"] and two.notes == []
+            got = await frame(watcher)
+            assert [(trouble.error, trouble.text.partition(": ")[2]) for trouble in got.troubles] == [
+                ("camera_black", "camera front is black")
+            ]
+            await ask(connection, "bright")
+            assert (await frame(watcher, lambda frame: [one.calls for one in frame.robots] == [2, 1])).robots[
+                0
+            ].notes == []
+
+    served(test, Noting())
 
 
 def test_a_clients_text_is_cut_and_keeps_its_direction() -> None:

@@ -159,7 +159,7 @@ def run(
             model=checkpoint.config.name,
             robot=plan.robot if plan.robot is None or isinstance(plan.robot, str) else plan.robot.name,
             weights=_weights_name(checkpoint),
-            random_weights=checkpoint.format == "random",
+            random_weights=checkpoint.random is not None,
             observations_seed=0,
             main_job=plan.main,
             solver=plan.solver,

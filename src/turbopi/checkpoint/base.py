@@ -22,6 +22,7 @@ from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig
 from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError
 
+SMALL_BYTES = 64 * 2**20  # of weights that are hashed at once, in a tenth of a second
 PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
 
 
@@ -71,6 +72,21 @@ class Checkpoint:
     def format(self) -> str:
         """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "random"."""
         return self.source.format
+
+    @property
+    def random(self) -> str | None:
+        """ "seed 0" of random weights; None: they aren't, as far as is known."""
+        return getattr(self.source, "random", None)
+
+    @cached_property
+    def short_hash(self) -> str | None:
+        """12 digits of `fingerprint`, if it is cached, or the weights are small; else None."""
+        known = hasattr(self.source, "recipe") or getattr(self.source, "weights_sha256", None) is not None
+        if known or self.stored_bytes <= SMALL_BYTES:
+            return self.fingerprint(trust_files=True)[:12]
+        key = self._files_key()
+        found = None if key is None else known_hashes.look_up(key)
+        return None if found is None else found[:12]
 
     @property
     def _named_tokenizer(self) -> list[Path]:
@@ -161,7 +177,8 @@ class Checkpoint:
         return {
             **describe_weights(self.source),
             "path": None if self.path is None else str(self.path),
-            "random_weights": self.format == "random",
+            "random_weights": self.random is not None,
+            "weights": self.short_hash,
             "kind": self.config.model.kind,
             "sizes": model_sizes_info(self.config),
             "name": self.config.name,
@@ -227,7 +244,13 @@ def model_sizes_info(config: PolicyConfig) -> dict[str, Any]:
 
 def norm_stats_info(stats: NormStats) -> dict[str, Any]:
     return {
-        name: None if feature is None else {"dim": feature.dim, "statistics": list(feature.available)}
+        name: None
+        if feature is None
+        else {
+            "dim": feature.dim,
+            "statistics": list(feature.available),
+            "values": {one: getattr(feature, one).tolist() for one in feature.available},
+        }
         for name, feature in (("state", stats.state), ("actions", stats.actions))
     }
 

@@ -30,7 +30,7 @@ from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
 from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
 from turbopi.checkpoint.sizes import VARIANTS
-from turbopi.checkpoint.source import Shape, check_finite
+from turbopi.checkpoint.source import RANDOM_KEY, Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, RealTime
 from turbopi.models.pi0.reference import FloatPrecision
@@ -100,7 +100,10 @@ def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision
     shapes = {to_openpi(name): shape for name, shape in checkpoint.source.shapes.items()}
     model = checkpoint.config.planned_model
     shapes[UNUSED_HEAD] = (model.vocab_size, model.expert.width)
-    header, slots, size = _header(shapes, stored, dtype.itemsize)
+    about = {TIED_EMBEDDING: TIED_HEAD}  # openpi's files record the tie like this
+    if checkpoint.random is not None:
+        about[RANDOM_KEY] = checkpoint.random
+    header, slots, size = _header(shapes, stored, dtype.itemsize, about)
     with (
         file.open("wb") as out,
         progress_bar(progress, f"writing {file.name}", checkpoint.stored_bytes) as advance,
@@ -118,10 +121,11 @@ def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision
         os.fsync(out.fileno())
 
 
-def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes, dict[str, _Slot], int]:
+def _header(
+    shapes: dict[str, Shape], stored: str, itemsize: int, about: dict[str, str]
+) -> tuple[bytes, dict[str, _Slot], int]:
     """The bytes before the data, each tensor's slot, and the length of the data."""
-    # openpi's files record the tie like this
-    entries: dict[str, object] = {"__metadata__": {TIED_EMBEDDING: TIED_HEAD}}
+    entries: dict[str, object] = {"__metadata__": about}
     spans, end = {}, 0
     for name in sorted(shapes):
         start, end = end, end + prod(shapes[name]) * itemsize

@@ -15,11 +15,11 @@ from typing import Any
 
 import torch
 
-from turbopi.checkpoint.source import Piece, Shape
+from turbopi.checkpoint.source import Piece, Shape, random_note
 from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
 from turbopi.models import parameter_shapes
 from turbopi.support.errors import CheckpointError, ConfigError
-from turbopi.support.reading import Fields, file_inside, is_integer, read_json, shown
+from turbopi.support.reading import Fields, file_inside, is_integer, one_line, read_json, shown
 
 MANIFEST = "turbopi_onnx.json"
 GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
@@ -67,6 +67,10 @@ class GraphSource:
         self.vision_heads: int | None = export.config.vision.num_heads
         self.weights_sha256: str = export.manifest["weights_sha256"]
         self.notes = ["ONNX graphs: only --backend onnx runs them"]
+        mark = export.manifest.get("random_weights")
+        self.random = mark if isinstance(mark, str) else None
+        if self.random is not None:
+            self.notes.append(random_note(one_line(self.random)))
         if "calibration" in export.manifest:
             quantized = tuple(f"vlm.layers.{layer}.mlp." for layer in range(export.config.vlm.depth - 1))
             self.dtypes |= {name: "F8_E4M3" for name in self.shapes if name.startswith(quantized)}

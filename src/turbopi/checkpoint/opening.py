@@ -80,7 +80,7 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         return {
             **describe_weights(source),
             "path": str(location.folder),
-            "random_weights": False,
+            "random_weights": getattr(source, "random", None) is not None,
             "kind": _kind(location, source),
             "assets": asset_ids(location.folder / "assets"),
             **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),

@@ -87,6 +87,7 @@ class PeftSource:
         merged = f"LoRA adapters of {len(self._pairs)} weights are merged into the weights of {base_folder}"
         others = f"; {len(self._replaced)} tensors come from the adapter whole" if self._replaced else ""
         self.notes = [*base.notes, merged + others]
+        self.random = base.random
 
     def native_name(self, name: str) -> str:
         return self._base.native_name(name)

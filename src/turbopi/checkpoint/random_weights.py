@@ -25,7 +25,7 @@ from torch import Tensor
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
-from turbopi.checkpoint.source import Piece, Shape, row_ranges
+from turbopi.checkpoint.source import Piece, Shape, random_note, row_ranges
 from turbopi.config import ModelConfig, PolicyConfig, preset
 from turbopi.models import RANDOM, parameter_shapes
 from turbopi.support.errors import ConfigError
@@ -48,7 +48,8 @@ class RandomSource:
             self.vision_heads = config.model.vision.num_heads
         else:
             self._norms = 1.0
-        self.notes = [f"random weights, seed {seed}: actions mean nothing"]
+        self.random: str | None = f"seed {seed}"
+        self.notes = [random_note(self.random)]
         self.recipe = ("turbopi random weights 1", seed, sorted(self.shapes.items()))
         self._seed = seed
 

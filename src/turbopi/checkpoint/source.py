@@ -19,6 +19,12 @@ from turbopi.support.reading import listing
 PIECE_BYTES = 8 * 2**20
 
 Shape = tuple[int, ...]
+RANDOM_KEY = "turbopi_random_weights"  # in the header of files that hold random weights: they stay marked
+
+
+def random_note(random: str) -> str:
+    """What every reader should know of random weights."""
+    return f"random weights, {random}: actions mean nothing"
 
 
 @dataclass(frozen=True)

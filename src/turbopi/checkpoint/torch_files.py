@@ -24,7 +24,16 @@ from turbopi.checkpoint.names import (
     common_prefix,
     current_name,
 )
-from turbopi.checkpoint.source import Piece, Shape, check_zeros, judged_for_zeros, listing, row_ranges
+from turbopi.checkpoint.source import (
+    RANDOM_KEY,
+    Piece,
+    Shape,
+    check_zeros,
+    judged_for_zeros,
+    listing,
+    random_note,
+    row_ranges,
+)
 from turbopi.support.errors import CheckpointError
 from turbopi.support.reading import Fields, one_line, open_file, read_json
 from turbopi.support.reading.files import HEAD_BYTES, failed_download
@@ -84,6 +93,9 @@ class TorchSource:
         self.shapes = {name: stored.shape for name, stored in self._stored.items()}
         self.dtypes = {name: stored.dtype for name, stored in self._stored.items()}
         self.files = sorted({stored.file for stored in self._stored.values()})
+        self.random = _random_mark(self.files[0])
+        if self.random is not None:
+            self.notes.append(random_note(self.random))
         empty = [name for name in _sampled_zero(self._stored) if not read_tensor(self._stored[name]).any()]
         self.notes += check_zeros(self, empty, folder)
 
@@ -189,6 +201,13 @@ def read_header(file: Path) -> list[Stored]:
         raise CheckpointError(
             f"{file} can't be read as safetensors ({one_line(error)}); is the download complete?"
         ) from error
+
+
+def _random_mark(file: Path) -> str | None:
+    """What the header says of random weights, whose actions mean nothing."""
+    with safe_open(file, "pt") as handle:
+        mark: str | None = (handle.metadata() or {}).get(RANDOM_KEY)
+    return None if mark is None else one_line(mark)
 
 
 def read_tensor(stored: Stored) -> Tensor:

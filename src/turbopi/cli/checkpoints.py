@@ -14,7 +14,6 @@ from rich.table import Table
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
-from turbopi.models import FAMILIES
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
 from turbopi.support.text import data_size, denoising
@@ -97,6 +96,7 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
     If it doesn't fit the checkpoint, ConfigError is raised for --robot's; of the configuration's a note says why.
     """
     from turbopi.robots.base import described
+    from turbopi.robots.labels import action_labels, state_labels
 
     opened = options.open(checkpoint)
     try:
@@ -106,9 +106,14 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
             raise
         return {"notes": [*notes, f"no policy can be made of this: {error}"]}
     about = pipeline.metadata
+    labels = {
+        "state": state_labels(pipeline.robot, pipeline.robot.state_dim or pipeline.state_scale.width or 0),
+        "actions": action_labels(pipeline.robot, about["robot_action_dim"]),
+    }
     return {
         **{key: about[key] for key in ("robot", "robot_state_dim", "robot_action_dim", "default_prompt")},
         "observation": described(pipeline.example()),
+        "labels": {feature: [one._asdict() for one in some] for feature, some in labels.items()},
         "notes": [*notes, *pipeline.notes],
     }
 
@@ -128,6 +133,9 @@ def _show(info: dict[str, Any], output: Output) -> None:
     for name, value in _facts(info):
         facts.add_row(name, escape(value))
     output.table(facts)
+    for feature in ("state", "actions") if info.get("norm_stats") else ():
+        if info["norm_stats"][feature] is not None:
+            output.table(_statistics_table(feature, info["norm_stats"][feature], info.get("labels", {}).get(feature)))
     parameters = Table(title="parameters", title_justify="left")
     parameters.add_column("part")
     parameters.add_column("count", justify="right")
@@ -172,7 +180,11 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         ("weights", f"{info['tensors']} tensors, {data_size(info['stored_bytes'])}, {_dtypes(info)}"),
         ("tokenizer", _tokenizer(info)),
     ]
-    return [*facts, ("SHA-256", info["sha256"])] if "sha256" in info else facts
+    if "sha256" in info:
+        return [*facts, ("SHA-256", info["sha256"])]
+    if "weights" in info:
+        facts.append(("weights' hash", info["weights"] or "not made yet: --hash reads them all, once"))
+    return facts
 
 
 def _tokenizer(info: dict[str, Any]) -> str:
@@ -180,7 +192,7 @@ def _tokenizer(info: dict[str, Any]) -> str:
 
     if info["tokenizers"]:
         return ", ".join(info["tokenizers"])
-    if info["random_weights"]:
+    if info["format"] == "random":
         return "Turbo-Pi's own small one"
     cached = cached_tokenizer()
     if cached.is_file():
@@ -189,12 +201,14 @@ def _tokenizer(info: dict[str, Any]) -> str:
 
 
 def _statistics_source(info: dict[str, Any]) -> str:
-    if info["random_weights"]:
+    if info["format"] == "random":
         return "made up: values of about 1"
     return f"asset {info['asset_id']}" if info["asset_id"] else OWN_FILES
 
 
 def _state_input(info: dict[str, Any]) -> str:
+    from turbopi.models import FAMILIES  # which imports torch
+
     if FAMILIES[info["kind"]].reads_state:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
@@ -210,12 +224,31 @@ def _statistics(stats: dict[str, Any] | None, mode: str) -> str:
     return f"{mode}; {have}"
 
 
+def _statistics_table(feature: str, stats: dict[str, Any], labels: list[dict[str, str]] | None) -> Table:
+    """What the training data were, dimension by dimension, as far as the robot has them."""
+    values = stats["values"]
+    shown = [name for name in ("q01", "q99", "mean", "std") if name in values]
+    if "q01" not in values:
+        shown = [name for name in ("min", "max", "mean", "std") if name in values]
+    labels = labels or [{"name": f"value {index}", "unit": ""} for index in range(stats["dim"])]
+    table = Table(title=f"{feature} in the training data", title_justify="left")
+    table.add_column(feature, overflow="fold")
+    if any(label["unit"] for label in labels):
+        table.add_column("unit", overflow="fold")
+    for name in shown:
+        table.add_column(name, justify="right")
+    for index, label in enumerate(labels[: stats["dim"]]):
+        unit = [label["unit"]] if len(table.columns) > 1 + len(shown) else []
+        table.add_row(escape(label["name"]), *unit, *(f"{values[name][index]:.4g}" for name in shown))
+    return table
+
+
 def _sizes(sizes: dict[str, int]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in sizes.items())
 
 
 def _dtypes(info: dict[str, Any]) -> str:
-    return "made as needed" if info["random_weights"] else f"stored as {', '.join(info['stored_dtypes'])}"
+    return "made as needed" if info["format"] == "random" else f"stored as {', '.join(info['stored_dtypes'])}"
 
 
 class _ConvertCommand(CheckpointThen):
@@ -271,7 +304,16 @@ def convert(
     output.line(f"{opened.format} -> {folder}: {data_size(size)} in {precision}, {seconds:.1f} s")
     output.line(f"Look at it with `turbopi inspect {folder}`.")
     output.document(
-        {"folder": folder, "precision": precision, "bytes": size, "seconds": seconds, "tokenizer": tokenizer}
+        {
+            "folder": folder,
+            "precision": precision,
+            "bytes": size,
+            "seconds": seconds,
+            "tokenizer": tokenizer,
+            "checkpoint_path": opened.path,
+            "weights": opened.short_hash,
+            "random_weights": opened.random is not None,
+        }
     )
 
 

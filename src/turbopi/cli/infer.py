@@ -15,7 +15,7 @@ from rich.table import Table
 from turbopi.cli.checkpoints import robot_pipeline
 from turbopi.cli.files import check_writable, load_noise
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new_console
-from turbopi.cli.options import PolicyOptions
+from turbopi.cli.options import ActingOptions
 from turbopi.cli.timings import STAGES, timing_columns
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.files import write_whole
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from turbopi.config import Network
     from turbopi.policy.policy import UnifiedPolicy
+    from turbopi.policy.ranges import DrawnRange
+    from turbopi.policy.watch import Reading
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 MAX_ROWS = 8  # of a plot; a recording's other calls are in the .npz
@@ -37,7 +39,7 @@ class _InferCommand(CheckpointThen):
 @command(
     "infer",
     cls=_InferCommand,
-    shared=PolicyOptions,
+    shared=ActingOptions,
     examples=(
         "turbopi infer checkpoints/pi05_libero observation.npz --config pi05_libero",
         "turbopi infer checkpoints/mine my_observation/ -o mine.npz --seed 7",
@@ -45,7 +47,7 @@ class _InferCommand(CheckpointThen):
     ),
 )
 def infer(
-    options: PolicyOptions,
+    options: ActingOptions,
     paths: Annotated[
         list[str],
         typer.Argument(
@@ -94,13 +96,15 @@ def infer(
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
     from turbopi.policy.call_options import checked_noise
-    from turbopi.preprocess.robot_checks import note_on_state
+    from turbopi.policy.readings import Checks
     from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
     for file in (out, drawing):
         if file is not None and file.exists():
             output.line(f"note: {file} is there, and is replaced; --out names another file", "yellow")
+    from turbopi.robots import read_state
+
     sources = _sources(Path(source), call)
     first = load_observation(sources[0])
     given_noise = None if noise is None else load_noise(noise)
@@ -109,9 +113,11 @@ def infer(
     with _naming(sources[0]):  # what is wrong with it is better known before minutes of loading
         pipeline = robot_pipeline(opened, options.make_robot(), options.default_prompt)
         seen = pipeline.see(first, resize=False)
-    doubt = note_on_state(seen.robot.state, pipeline.state_scale)
-    if doubt is not None and opened.format != "random":
-        output.line(f"note: {sources[0]}: {doubt}", "yellow")
+        read_state(seen.robot.state, "state", None)
+        judges_ranges = opened.format != "random"
+        checks = Checks(pipeline, opened.norm_stats, options.out_of_range, judges_ranges)  # type: ignore[arg-type]
+    noted, ranges = _Notes(output), checks.drawn
+    noted.of(sources[0], checks.reading(seen))
     model = opened.config.model
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
@@ -122,11 +128,11 @@ def infer(
             output.line("warm-up: compiling, which takes a minute or more")
         output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")
-    answers = _run(policy, sources, draw, output)
+    answers = _run(policy, sources, draw, noted)
     _show_timings([answer.timing for answer in answers], output)
     _write(out, answers, output)
     if drawing is not None:
-        _plot(drawing, policy.metadata, answers)
+        _plot(drawing, policy, answers, ranges)
         output.line(f"plot written to {drawing}")
     output.document(
         {
@@ -134,6 +140,7 @@ def infer(
             "policy_timing": [answer.timing for answer in answers],
             "out": out,
             "plot": drawing,
+            "notes": [answer.notes for answer in answers],
             "policy": policy.metadata,
         }
     )
@@ -147,6 +154,7 @@ class _Answer:
     noise: "np.ndarray"
     actions: "np.ndarray"
     timing: dict[str, float]
+    notes: list[dict[str, Any]]
 
 
 def _check_targets(source: Path, out: Path, drawing: Path | None) -> None:
@@ -220,21 +228,39 @@ def _noise(
     return lambda number: np.random.default_rng(first + number).standard_normal(shape, dtype=np.float32)
 
 
+class _Notes:
+    """On each observation and its actions. None is compared with another: a recording may mix robots."""
+
+    def __init__(self, output: Output) -> None:
+        from turbopi.policy.watch import Watch
+
+        self.output, self._watch = output, Watch(remembers=False)
+
+    def of(self, source: Path, reading: "Reading | None") -> list[dict[str, Any]]:
+        """The notes of a call, as --json has them. Printed is each once, of the same joints or cameras."""
+        notes = [] if reading is None else self._watch.notes(reading)
+        for note in self._watch.to_log(notes):
+            self.output.line(f"note: {source}: {note.text}", "yellow")
+        return [note.plain for note in notes]
+
+
 def _run(
-    policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray"], output: Output
+    policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray"], noted: _Notes
 ) -> list[_Answer]:
     """Every observation through the policy. ObservationError names the file of a recording that is wrong."""
+    from turbopi.policy.watch import READING
     from turbopi.recordings import load_observation
 
     answers = []
-    hidden = not output.shows_progress or len(sources) == 1
+    hidden = not noted.output.shows_progress or len(sources) == 1
     with Progress(console=new_console(stderr=True), disable=hidden, transient=True) as bar:
         for number, source in enumerate(bar.track(sources, description="observations")):
             observation, noise = load_observation(source), draw(number)
             with _naming(source):
-                result = policy.infer(observation, noise=noise)
+                result = policy.infer(observation, noise=noise, readings=True)
+            notes = noted.of(source, result.get(READING))
             kept = observation if number < MAX_ROWS else None
-            answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"]))
+            answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"], notes))
     return answers
 
 
@@ -280,19 +306,33 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
     output.line(STAGES, "dim")
 
 
-def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:
+def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: "tuple[DrawnRange, DrawnRange]") -> None:
     from turbopi.support.action_groups import images_of
     from turbopi.support.plots import Row, plot_chunks
 
+    about = policy.metadata
     rows = [
-        Row(_prompt(answer.observation, about), images_of(answer.observation), answer.actions)
+        Row(
+            _prompt(answer.observation, about),
+            images_of(answer.observation),
+            answer.actions,
+            state=policy.pipeline.state(answer.observation),
+        )
         for answer in answers
         if answer.observation is not None
     ]
     title = f"{about['config']}, {about['backend']} {about['precision']} on {about['device_name']}"
     if len(rows) < len(answers):
         title += f": the first {len(rows)} of {len(answers)} calls"
-    plot_chunks(file, rows, robot=about["robot"], title=title, random_weights=about["random_weights"])
+    plot_chunks(
+        file,
+        rows,
+        robot=about["robot"],
+        title=title,
+        random_weights=about["random_weights"],
+        state_range=ranges[0],
+        action_range=ranges[1],
+    )
 
 
 def _prompt(observation: dict[str, Any], about: dict[str, Any]) -> str:

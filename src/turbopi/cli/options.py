@@ -145,11 +145,9 @@ class WeightOptions:
             raise ConfigError("--weights-seed is the seed of --random-weights, which wasn't given")
 
     def tell_if_random(self, checkpoint: "Checkpoint", output: Output) -> None:
-        if checkpoint.format == "random":
-            seed = self.weights_seed or 0
-            output.line(
-                f"RANDOM WEIGHTS ({self.random_weights}, seed {seed}): the actions mean nothing.", "bold yellow"
-            )
+        if checkpoint.random is not None:
+            which = f"{self.random_weights}, " if self.random_weights is not None else ""
+            output.line(f"RANDOM WEIGHTS ({which}{checkpoint.random}): the actions mean nothing.", "bold yellow")
 
 
 @dataclass(frozen=True)
@@ -317,3 +315,22 @@ class PolicyOptions(RobotOptions):
         from turbopi.quantization.calibration_file import Quantization
 
         return Quantization.load(self.quantization).only([part.strip() for part in self.fp8_parts.split(",")])
+
+
+@dataclass(frozen=True)
+class ActingOptions(PolicyOptions):
+    """The same, of commands whose actions a robot may carry out."""
+
+    out_of_range: Annotated[
+        str,
+        _option(
+            "--out-of-range",
+            panel=_RUNNING,
+            metavar="warn|refuse|clip",
+            help="Actions far outside the checkpoint's training range: sent with a note, refused, or clipped, which "
+            "the answer says. These are no limits of your robot: docs/safety.md.",
+        ),
+    ] = "warn"
+
+    def policy_arguments(self) -> dict[str, Any]:
+        return {**super().policy_arguments(), "out_of_range": self.out_of_range}

@@ -12,7 +12,7 @@ from turbopi.cli.capabilities import check_server, check_warmup
 from turbopi.cli.files import check_folder
 from turbopi.cli.fleet_update import Requested
 from turbopi.cli.framework import Output, command, log_to_stderr
-from turbopi.cli.options import COMMON, CheckpointArgument, PolicyOptions
+from turbopi.cli.options import COMMON, ActingOptions, CheckpointArgument
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
 from turbopi.cli.settings import PrintSettings, Settings, print_settings
@@ -32,7 +32,7 @@ _REAL_TIME, _RECORDING = "Real-time execution", "Recording"
 
 @command(
     "serve",
-    shared=PolicyOptions,
+    shared=ActingOptions,
     common=(
         *("--host", "--port", "--api-key-file", "--record", "--max-batch", "--execution", "--control-hz"),
         *("--settings", "--print-settings", *COMMON),
@@ -49,7 +49,7 @@ _REAL_TIME, _RECORDING = "Real-time execution", "Recording"
     ),
 )
 def serve(
-    options: PolicyOptions,
+    options: ActingOptions,
     context: typer.Context,
     checkpoint: CheckpointArgument = None,
     host: Annotated[
@@ -310,8 +310,10 @@ class _Cold:
     def pipelined(self) -> bool:
         return self._policy.pipelined
 
+    gives_readings = True
+
     def infer(self, obs: dict[str, object], /, **arguments: Any) -> dict[str, object]:
         return self._policy.infer(obs, **arguments)
 
-    def submit(self, obs: dict[str, object], /) -> "Future[dict[str, object]]":
-        return self._policy.submit(obs)
+    def submit(self, obs: dict[str, object], /, **arguments: Any) -> "Future[dict[str, object]]":
+        return self._policy.submit(obs, **arguments)

@@ -16,6 +16,7 @@ OF_POLICIES = {
     "tokenizer": "--tokenizer",
     "default_prompt": "--default-prompt",
     "strict": "--strict",
+    "out_of_range": "--out-of-range",
 }
 OF_SERVERS = {
     "host": "--host",

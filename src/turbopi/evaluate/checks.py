@@ -6,6 +6,7 @@ from typing import Any
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
 from turbopi.realtime import way_named
+from turbopi.robots.base import Example
 from turbopi.sim import SimSettings, Simulator
 from turbopi.sim.base import faults_named, observation_problem
 from turbopi.support.errors import ConfigError, ObservationError
@@ -23,7 +24,8 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
     problem = observation_problem(example, simulator.image_keys)
     if problem is not None:
         raise ConfigError(f"the example of an observation that {simulator.name} gives can't be used: {problem}")
-    example |= {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}
+    resized = {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}
+    example = Example(example | resized)
     robot = f"use one for the robot {simulator.robot}, such as config pi05_{simulator.robot}"
     try:
         answer = source.infer([example], [0])[0]

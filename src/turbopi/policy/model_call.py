@@ -16,6 +16,7 @@ from turbopi import backends
 from turbopi.backends.device_lost import Guard
 from turbopi.models.observation import Observation
 from turbopi.policy.chunk_conditioning import ChunkConditioning, Joins
+from turbopi.policy.readings import Checks, Reading
 from turbopi.preprocess.pipeline import Pipeline
 
 
@@ -25,6 +26,7 @@ class Ran:
 
     sample: backends.Sample
     states: list[np.ndarray]  # of each observation, as the pipeline's `after` takes it
+    readings: list[Reading | None]
     requested: float  # the inputs are ready, but for what is done beside the device
     infer_start: float  # other threads' calls are over
     infer_end: float
@@ -34,9 +36,15 @@ class ModelCall:
     """Of one policy, by the backend that it holds. One call at a time: others wait for `lock`."""
 
     def __init__(
-        self, pipeline: Pipeline, conditioning: ChunkConditioning, backend: backends.Backend, guard: Guard
+        self,
+        pipeline: Pipeline,
+        conditioning: ChunkConditioning,
+        backend: backends.Backend,
+        guard: Guard,
+        checks: Checks,
     ) -> None:
         self._pipeline, self._conditioning, self._backend, self._guard = pipeline, conditioning, backend, guard
+        self._checks = checks
         self.lock = threading.Lock()
 
     def run(
@@ -48,14 +56,15 @@ class ModelCall:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
         if self._backend.begins:
             return self._begin(observations, joins, noise)
-        prepared = [self._pipeline.before(obs) for obs in observations]
-        inputs, states = Observation.stack([one for one, _ in prepared]), [state for _, state in prepared]
+        each = [self._pipeline.see(obs) for obs in observations]
+        inputs = Observation.stack([self._pipeline.complete(seen) for seen in each])
+        states, readings = [seen.state for seen in each], [self._checks.reading(seen) for seen in each]
         x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states)
         requested = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
             sample = self._backend.sample(inputs, x_1, joins.steps, conditioning=conditioning)
-            return Ran(sample, states, requested, infer_start, time.perf_counter())
+            return Ran(sample, states, readings, requested, infer_start, time.perf_counter())
 
     def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
         each = [self._pipeline.see(obs, resize=False) for obs in observations]
@@ -66,8 +75,9 @@ class ModelCall:
             begun = self._backend.begin_batch(images, resize, joins.forms)
             for seen in each:
                 self._pipeline.read(seen)  # while the device is at the first ones' images
+            readings = [self._checks.reading(seen) for seen in each]
             x_1, states = noise(), [seen.state for seen in each]
             conditioning = self._conditioning.conditioning(joins, states)
             tokens, state = [seen.tokens[seen.token_mask] for seen in each], np.stack([one.model_state for one in each])
             sample = begun.finish(tokens, state, x_1, joins.steps, conditioning)
-            return Ran(sample, states, requested, infer_start, time.perf_counter())
+            return Ran(sample, states, readings, requested, infer_start, time.perf_counter())

@@ -35,6 +35,8 @@ from turbopi.policy.call_options import (
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.model_call import ModelCall
+from turbopi.policy.readings import Checks, OutOfRange
+from turbopi.policy.watch import PolicyWatch
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.calibration_file import Quantization
@@ -70,6 +72,8 @@ class UnifiedPolicy:
         default_prompt: for observations without a prompt.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
+        out_of_range: what becomes of actions far outside the training range: "warn", "clip" or "refuse", with an
+            ActionError (docs/safety.md).
         strict: refuse calls that `warmup` didn't cover, with an ObservationError, instead of compiling while a robot
             moves.
 
@@ -94,6 +98,7 @@ class UnifiedPolicy:
         robot: str | Robot | None = None,
         progress: bool = False,
         strict: bool = False,
+        out_of_range: OutOfRange = "warn",
     ) -> None:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
@@ -110,6 +115,10 @@ class UnifiedPolicy:
         self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
         prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
+        self._checks = Checks(
+            self._pipeline, checkpoint.norm_stats, out_of_range, judges_ranges=checkpoint.format != "random"
+        )
+        self._watch = PolicyWatch()
         of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes
         for note in (*of_weights, *self._pipeline.notes):
             logger.warning("%s", note)
@@ -121,6 +130,7 @@ class UnifiedPolicy:
             return loaded.state
 
         calibration = for_policy(quantization, precision, checkpoint)
+        self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
@@ -128,7 +138,7 @@ class UnifiedPolicy:
             )
         self.backend.strict = self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
-        self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard)
+        self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard, self._checks)
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint
@@ -146,6 +156,7 @@ class UnifiedPolicy:
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
         model_actions: bool = False,
+        readings: bool = False,
     ) -> dict[str, Any]:
         """One observation to one action chunk.
 
@@ -161,6 +172,7 @@ class UnifiedPolicy:
             conditioning: instead of `previous`, exact instructions to the denoising loop (models/pi0/conditioning.py).
                 One with its own times or solver determines the number of steps.
             model_actions: also return what the next call's `previous` needs.
+            readings: for a server: what notes are made of, under "reading", instead of them.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
@@ -172,17 +184,20 @@ class UnifiedPolicy:
             postprocess_ms   un-normalising and the robot's own outputs
             total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
 
+        If there is something to say, also "turbopi/notes" (docs/safety.md), a list of {"kind", "names", "text"}.
+
         With `model_actions` also "model_actions": float32[H, action_dim], normalised, and for relative actions
         "anchor": float64[d], the state that they are relative to.
 
-        Raises ObservationError for wrong arguments, ActionError if an action is NaN or infinite, DeviceLost once the
-        GPU has failed for good (`lost`).
+        Raises ObservationError for wrong arguments, ActionError if an action is NaN, infinite or refused, DeviceLost
+        once the GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
         joined = of_each("previous", [previous], 1, RunningChunk)
         requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
-        return self._infer([obs], noises, seed, requested, horizon, own, joined, [model_actions])[0]
+        row = [obs], noises, seed, requested, horizon, own, joined, [model_actions]
+        return self._infer(*row, hand_over=readings, one_robot=True)[0]
 
     def infer_batch(
         self,
@@ -197,6 +212,7 @@ class UnifiedPolicy:
         conditioning: Sequence[Conditioning | None] | None = None,
         previous: Sequence[RunningChunk | None] | None = None,
         model_actions: bool | Sequence[bool] = False,
+        readings: bool = False,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
 
@@ -218,7 +234,8 @@ class UnifiedPolicy:
             of_each("previous", previous, rows, RunningChunk),
             flags("model_actions", model_actions, rows),
         )
-        return self._infer(observations, noise, seed, requested, horizon, own, joined, reported)
+        several = observations, noise, seed, requested, horizon, own, joined, reported
+        return self._infer(*several, hand_over=readings, one_robot=False)
 
     def _infer(
         self,
@@ -230,8 +247,11 @@ class UnifiedPolicy:
         conditionings: Sequence[Conditioning | None],
         previous: Sequence[RunningChunk | None],
         model_actions: Sequence[bool],
+        *,
+        hand_over: bool,
+        one_robot: bool,
     ) -> list[dict[str, Any]]:
-        """`infer_batch`; the last three have one for each observation."""
+        """`infer_batch`; the last three before the flags have one for each observation. Flags: `PolicyWatch.report`."""
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         if not observations:
@@ -239,8 +259,9 @@ class UnifiedPolicy:
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
         joins = self._conditioning.checked(conditionings, previous, steps, actions, denoising.integration)
         ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
-        chunks = ran.sample.actions.numpy()
+        chunks, readings = self._checks.judge(ran.sample.actions.numpy(), ran.readings)
         results = self._pipeline.after_all(chunks, ran.states)
+        self._watch.report(results, readings, hand_over=hand_over, one_robot=one_robot)
         for row, result in enumerate(results):
             if model_actions[row]:
                 result["model_actions"] = chunks[row].copy()
@@ -258,6 +279,7 @@ class UnifiedPolicy:
         num_steps: int | None = None,
         horizon: int | None = None,
         serially: bool = False,
+        readings: bool = False,
     ) -> "Future[dict[str, Any]]":
         """`infer` that returns at once, with a Future of what `infer` returns; several may be in flight.
 
@@ -266,12 +288,14 @@ class UnifiedPolicy:
         """
         if serially and not self.pipelined:
             done: Future[dict[str, Any]] = Future()
-            done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps, horizon=horizon))
+            arguments: dict[str, Any] = {"noise": noise, "seed": seed, "num_steps": num_steps, "horizon": horizon}
+            done.set_result(self.infer(obs, **arguments, readings=readings))
             return done
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
-        inputs, state = self._pipeline.before(obs)
+        seen = self._pipeline.see(obs)
+        inputs, reading = self._pipeline.complete(seen), self._checks.reading(seen)
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         requested = time.perf_counter()
         with self._guard:
@@ -286,7 +310,9 @@ class UnifiedPolicy:
                     self._guard.examine(error)
                     raise
                 infer_end = time.perf_counter()
-                result = self._pipeline.after_all(sample.actions.numpy(), [state])[0]
+                chunks, judged = self._checks.judge(sample.actions.numpy(), [reading])
+                (result,) = results = self._pipeline.after_all(chunks, [seen.state])
+                self._watch.report(results, judged, hand_over=readings, one_robot=True)
                 infer_start = requested + sample.queue_ms / 1e3
                 timing = sample.timing(start, requested, infer_start, infer_end, time.perf_counter())
                 answer.set_result(result | {"policy_timing": timing})
@@ -297,7 +323,8 @@ class UnifiedPolicy:
         return answer
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`. A policy has no state between calls, so nothing happens."""
+        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before."""
+        self._watch.reset()
 
     def warmup(
         self,
@@ -393,6 +420,8 @@ class UnifiedPolicy:
         requested = self._denoising.integration
         return {} if requested is None else {"conditioning": Conditioning(integration=requested)}
 
+    gives_readings = True  # to the server: `infer`, `infer_batch` and `submit` take `readings`
+
     @property
     def pipelined(self) -> bool:
         """Whether `submit` overlaps observations; the server uses it then."""
@@ -420,7 +449,11 @@ class UnifiedPolicy:
             "device": str(self._device),
             "device_name": torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else "CPU",
             "checkpoint_format": self._checkpoint.format,
-            "random_weights": self._checkpoint.format == "random",
+            "random_weights": self._checkpoint.random is not None,
+            "checkpoint_path": None if self._checkpoint.path is None else str(self._checkpoint.path),
+            "weights": self._checkpoint.short_hash,
+            "calibration": self._calibration,
+            "out_of_range": self._checks.out_of_range,
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
             "real_time": {"modes": list(self._conditioning.modes), **dataclasses.asdict(self.config.real_time)},

@@ -9,6 +9,7 @@ import numpy as np
 
 from turbopi.checkpoint import Checkpoint, load_norm_stats
 from turbopi.policy.policy import UnifiedPolicy
+from turbopi.robots.base import Example
 from turbopi.support.errors import TurboPiError
 from turbopi.support.reading.images import read_image
 
@@ -92,7 +93,7 @@ def _with_images(observation: Mapping[str, object], frame: Frame) -> dict[str, o
             return _like(next(camera_images, frame.wrist), value)
         return frame.prompt if key in ("prompt", "task") else value
 
-    return {key: replaced(key, value) for key, value in observation.items()}
+    return Example({key: replaced(key, value) for key, value in observation.items()})
 
 
 def _like(camera_image: np.ndarray, other: np.ndarray) -> np.ndarray:

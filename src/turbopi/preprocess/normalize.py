@@ -86,21 +86,6 @@ class Normalizer:
                 case _:  # lerobot_quantile, lerobot_min_max
                     return np.asarray(2.0 * (x.astype(np.float32) - a) / span - 1.0, np.float64)
 
-    def far_outside(self, x: np.ndarray) -> list[tuple[int, float, float]]:
-        """Numbers of float[d] that are far from all that the statistics saw: (place, least, most) of each.
-
-        Far is more than twice the statistics' range beyond it. By z-score the range is five deviations about the mean.
-        Where the statistics saw one number alone, or none, nothing is far.
-        """
-        if self.width is None:
-            return []
-        x = x[: self.width]
-        a, b = self._a[: len(x)].astype(np.float64), self._b[: len(x)].astype(np.float64)
-        low, high = (a - 5 * b, a + 5 * b) if self.mode.endswith("zscore") else (a, b)
-        beyond = 2 * (high - low)
-        far = (high > low) & ((x < low - beyond) | (x > high + beyond))
-        return [(int(i), float(low[i]), float(high[i])) for i in np.flatnonzero(far)]
-
     def says_something_past(self, width: int) -> bool:
         """Whether the statistics past the first `width` values are more than padding: not all 0."""
         return self.width is not None and bool(np.any(self._a[width:]) or np.any(self._b[width:]))

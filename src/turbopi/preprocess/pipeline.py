@@ -26,7 +26,7 @@ from turbopi.preprocess.robot_checks import (
 )
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
-from turbopi.robots.base import all_finite, keys_of, listed, read_prompt, read_state
+from turbopi.robots.base import Example, all_finite, keys_of, listed, read_prompt, read_state
 from turbopi.robots.images import check_hwc, is_rgb8, to_uint8
 from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.plain import Plain
@@ -40,6 +40,7 @@ class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
     resize          False: images in uint8 keep their size, for a backend that resizes them
+    cameras         the model's, in its order: keys of the robot's images
     images        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
     valid           of each camera, whether there is such an image
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
@@ -51,6 +52,7 @@ class Incoming:
     resize: bool = True
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
+    cameras: tuple[str, ...] = field(init=False)
     camera_images: list[np.ndarray] = field(init=False)
     valid: list[bool] = field(init=False)
 
@@ -134,13 +136,17 @@ class Pipeline:
         be used.
         """
         one = self.see(observation)
+        return self.complete(one), one.state
+
+    def complete(self, one: Incoming) -> ModelInputs:
+        """The model's inputs for an observation of which `see` has made the first half; makes the second."""
         self.read(one)
         black, dtype = (-1, np.float32) if self._float_images else (0, np.uint8)
         images: np.ndarray = np.empty((len(one.valid), *self._image_shape, 3), dtype)
         camera_images = iter(one.camera_images)
         for valid, image in zip(one.valid, images, strict=True):
             image[:] = next(camera_images) if valid else black
-        return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
+        return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state)
 
     def see(self, observation: Mapping[str, object], *, resize: bool = True) -> Incoming:
         """The first half of `before`: all that vision needs. `read` is the other. `resize`: see `Incoming`."""
@@ -150,6 +156,10 @@ class Pipeline:
         for step in self.before_vision:
             step(one)
         return one
+
+    def state(self, observation: Mapping[str, object]) -> np.ndarray:
+        """The robot's state in an observation, float[s], in the units of the statistics. Raises ObservationError."""
+        return read_state(read_observation(self.robot, observation).state, "state", self.robot.state_dim)
 
     def read(self, one: Incoming) -> None:
         """The second half of `before`: state and prompt."""
@@ -247,7 +257,7 @@ class Pipeline:
         made = self.robot.example(np.random.default_rng(seed))
         if isinstance(self.robot, Plain):  # takes any width, the statistics don't
             made["state"] = self.state_scale.fitted(made["state"])
-        return made
+        return Example(made)
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -288,9 +298,9 @@ class Pipeline:
     def _resize_images(self, sample: Incoming) -> None:
         camera_images, present = sample.robot.images, sample.robot.image_mask
         final = sample.robot.in_order or not _CAMERAS.issuperset(camera_images)
-        cameras = tuple(camera_images) if final else CAMERAS
+        sample.cameras = tuple(camera_images) if final else CAMERAS
         sample.valid, checked = [], []
-        for camera in cameras:
+        for camera in sample.cameras:
             valid = present.get(camera, camera in camera_images)
             sample.valid.append(valid)
             if valid:
@@ -362,7 +372,7 @@ class Pipeline:
             except ActionError as error:
                 if rows == 1:
                     raise
-                raise ActionError(_of_row(row, rows, str(error))) from None
+                raise ActionError(of_row(row, rows, str(error))) from None
             written[row] = given
         out.actions = written
 
@@ -414,7 +424,7 @@ def _not_finite(batch: np.ndarray, who: str, advice: str) -> ActionError:
     places = np.argwhere(~np.isfinite(actions))
     step, column = map(int, places[0])
     return ActionError(
-        _of_row(
+        of_row(
             row,
             len(batch),
             f"{who} actions that no robot may be given: {len(places)} of {actions.size} numbers aren't finite, the "
@@ -423,6 +433,6 @@ def _not_finite(batch: np.ndarray, who: str, advice: str) -> ActionError:
     )
 
 
-def _of_row(row: int, rows: int, message: str) -> str:
+def of_row(row: int, rows: int, message: str) -> str:
     """What is wrong with an observation; if it is one of several, with its number."""
     return message if rows == 1 else f"observation {row} of {rows} (from 0): {message}"

@@ -89,16 +89,3 @@ def notes_on_statistics(robot: Robot, state: Normalizer, actions: Normalizer) ->
                 f"{scale.width}: {what(width, extra)}, as openpi does. Are they this robot's statistics?"
             )
     return notes
-
-
-def note_on_state(state: np.ndarray, scale: Normalizer) -> str | None:
-    """What the user should know of a state float[s] that is far from the training data, as degrees for radians are."""
-    far = scale.far_outside(state)
-    if not far:
-        return None
-    shown = [f"value {i} is {state[i]:.4g}, in the training data {low:.4g} to {high:.4g}" for i, low, high in far[:3]]
-    more = f"; so are {len(far) - 3} more" if len(far) > 3 else ""
-    return (
-        f"the state is far from the checkpoint's statistics: {'; '.join(shown)}{more} (counted from 0). Are its units "
-        "and the order of its joints those of the training data?"
-    )

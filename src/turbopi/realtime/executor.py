@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, get_args
@@ -313,6 +314,7 @@ class RealTimeExecutor:
             "commands": dict(sorted(journal.kinds.items())),
             "observations": dict(sorted(journal.observations.items())),
             "clock_jumps": journal.clock_jumps,
+            "notes": [asdict(one) for one in journal.notes.values()],
             "remaining": queue.remaining,
             "waited": queue.waited,
             "latency_ms": summary(list(latencies)),
@@ -390,6 +392,7 @@ class RealTimeExecutor:
         else:
             result, seconds = future.result()
             self._journal.latencies_ms.append(seconds * 1e3)
+            self._journal.note(entry.chunk, result)
             if now - taken_at > self._max_age:
                 self._queue.fail("stale", f"its observation is {now - taken_at:.3f} s old")
                 entry.outcome = "stale"

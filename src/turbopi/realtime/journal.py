@@ -7,9 +7,11 @@ from typing import Literal
 
 import numpy as np
 
+from turbopi.realtime.messages import notes_in
 from turbopi.support.errors import TurboPiError
 
 KEPT = 20_000  # commands: 400 s at 50 Hz
+KEPT_NOTES = 100  # of different kinds, joints and cameras
 
 Kind = Literal["fresh", "slowed", "held", "waiting"]
 
@@ -56,6 +58,18 @@ class Inferred:
 
 
 @dataclass
+class Noted:
+    """A note that answers had, of one kind and on the same joints or cameras: the last text, and in which chunks."""
+
+    kind: str
+    names: tuple[str, ...]
+    text: str
+    chunks: int
+    first: int
+    last: int
+
+
+@dataclass
 class Journal:
     """The last commands, observations and latencies, and counts of all of them."""
 
@@ -65,14 +79,25 @@ class Journal:
     observations: Counter[str] = field(default_factory=Counter)
     clock_jumps: int = 0
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+    notes: dict[tuple[str, tuple[str, ...]], Noted] = field(default_factory=dict)
 
     def command(self, step: int, command: Command) -> None:
         self.commands.append((step, command))
         self.kinds[command.kind] += 1
 
+    def note(self, chunk: int, answer: object) -> None:
+        """Keep the notes of a chunk's answer."""
+        for one in notes_in(answer):
+            known = self.notes.get(one[:2])
+            if known is not None:
+                known.text, known.chunks, known.last = one.text, known.chunks + 1, chunk
+            elif len(self.notes) < KEPT_NOTES:
+                self.notes[one[:2]] = Noted(*one, 1, chunk, chunk)
+
     def copy(self) -> "Journal":
         copied = copy.copy(self)
         copied.commands, copied.latencies_ms = self.commands.copy(), self.latencies_ms.copy()
         copied.inferred = deque(copy.copy(one) for one in self.inferred)
+        copied.notes = {key: copy.copy(one) for key, one in self.notes.items()}
         copied.kinds, copied.observations = self.kinds.copy(), self.observations.copy()
         return copied

@@ -7,7 +7,7 @@ refuses or ignores them, so a client looks for "real_time" in the server's metad
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.support.errors import ObservationError
 
 PREFIX = "turbopi/"
+NOTES = PREFIX + "notes"  # of an answer: a list of {"kind", "names", "text"}
+MOST_NOTES = 32  # of an answer: others aren't read
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
 MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
@@ -217,3 +219,26 @@ def _first(values: np.ndarray, bad: np.ndarray, key: str) -> str:
     """The beginning of an error's text: the first `bad` value, and its place."""
     place = tuple(int(axis) for axis in np.argwhere(bad)[0])
     return f"{PREFIX}{key} has {float(values[place]):.3g} at {list(place)}"
+
+
+class Note(NamedTuple):
+    """A note of an answer; kinds: turbopi.policy.watch. names: of the joints or cameras that it is about."""
+
+    kind: str
+    names: tuple[str, ...]
+    text: str
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """As it is sent."""
+        return {"kind": self.kind, "names": list(self.names), "text": self.text}
+
+
+def notes_in(answer: object) -> list[Note]:
+    """The notes of an answer. What isn't one is left out: the policy may be of another make."""
+    notes = answer.get(NOTES) if isinstance(answer, Mapping) else None
+    return [
+        Note(str(one.get("kind")), tuple(map(str, one["names"])), str(one.get("text")))
+        for one in (notes[:MOST_NOTES] if isinstance(notes, list) else ())
+        if isinstance(one, Mapping) and isinstance(one.get("names"), list | tuple)
+    ]

@@ -38,6 +38,10 @@ class RobotInputs:
     in_order: bool = False
 
 
+class Example(dict[str, Any]):
+    """A made-up observation: its state and images say nothing of any robot, so nobody is told of them."""
+
+
 @runtime_checkable
 class Robot(Protocol):
     """A robot's side of the pipeline. Subclass it and override what differs; only its three methods have no default.

@@ -39,6 +39,9 @@ class Policy(Protocol):
     measure it on, observations of several clients run together where that is sooner. With `batch_modes`, too, so do
     those that join a chunk in one of these modes: `infer_batch` then takes `previous` and `model_actions`, lists with
     one for each observation.
+
+    With a true `gives_readings`, all three are given `readings=True`, and their results hold a
+    `turbopi.policy.readings.Reading` of the call under "reading", of which the server makes notes.
     """
 
     @property
@@ -71,6 +74,7 @@ class PolicyCalls:
     ) -> None:
         self._policy = policy
         self._pipelined = bool(getattr(policy, "pipelined", False))
+        self._readings = {"readings": True} if getattr(policy, "gives_readings", False) else {}
         self._metrics = metrics
         self._on_lost = on_lost
         self._max_batch, self._execution = options.max_batch, options.execution
@@ -269,13 +273,15 @@ class PolicyCalls:
         return Ran([[result]], None if result.error else result.seconds)
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
-        return self._result(time.perf_counter(), partial(self._policy.infer, observation, **arguments), arguments)
+        infer = partial(self._policy.infer, observation, **arguments, **self._readings)
+        return self._result(time.perf_counter(), infer, arguments)
 
     def _infer_batch(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
         """`arguments` of `infer`, for each observation; those that no observation has are left out."""
-        answers = self._policy.infer_batch(list(observations), **of_batch(arguments))  # type: ignore[attr-defined]
+        of_rows = of_batch(arguments)
+        answers = self._policy.infer_batch(list(observations), **of_rows, **self._readings)  # type: ignore[attr-defined]
         if not isinstance(answers, list) or len(answers) != len(observations):
             raise TypeError(f"infer_batch must return a list of {len(observations)} results")
         return answers
@@ -312,7 +318,7 @@ class PolicyCalls:
         started = time.perf_counter()
         results: Future[list[Result]] = Future()
         try:
-            answer: Future[dict[str, Any]] = self._policy.submit(observation)  # type: ignore[attr-defined]
+            answer: Future[dict[str, Any]] = self._policy.submit(observation, **self._readings)  # type: ignore[attr-defined]
         except BaseException as error:
             answer = Future()
             answer.set_exception(error)

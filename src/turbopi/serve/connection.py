@@ -18,6 +18,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
+from turbopi.policy.watch import Watch
 from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
@@ -100,6 +101,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
         self.bad_in_a_row = 0
         self.unpacker = Unpacker()  # of its messages
+        self.watch, self.batch_watch = Watch(), Watch(remembers=False)  # of its robot; of the rows of batch messages
         self._owner, self._shared, self._limits = owner, shared, limits
         self._credit = Credit(limits, shared.pool, shared.clock)
         self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
+from turbopi.policy.watch import KINDS as NOTE_KINDS
 from turbopi.serve.scheduling.schedule import PRIORITIES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -77,10 +78,15 @@ class Metrics:
             buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
             registry=self.registry,
         )
+        self._notes = Counter(
+            "turbopi_notes", "Notes on states, actions and cameras, in answers", ["kind"], registry=self.registry
+        )
         self._sessions_dropped = Counter(
             "turbopi_real_time_sessions_dropped", "Sessions that ended", ["reason"], registry=self.registry
         )
         self._add_scheduling()
+        for kind in NOTE_KINDS:
+            self._notes.labels(kind)
         for joined in ("yes", "no"):
             self._joined.labels(joined)
         for reason in DROPPED_SESSIONS:
@@ -148,6 +154,9 @@ class Metrics:
 
     def joined(self, joined: bool) -> None:
         self._joined.labels("yes" if joined else "no").inc()
+
+    def note(self, kind: str) -> None:
+        self._notes.labels(kind).inc()
 
     def session_dropped(self, reason: str) -> None:
         assert reason in DROPPED_SESSIONS, reason

@@ -10,6 +10,7 @@ docs/dev/request.md follows one observation all the way; docs/serving_sessions.m
 
 import asyncio
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,12 +19,13 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from turbopi.realtime.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
+from turbopi.policy.watch import READING, Reading, Watch
+from turbopi.realtime.messages import MAX_STEP, MOST_NOTES, NOTES, PREFIX, SCHEDULING_KEYS, Note, as_number, notes_in
 from turbopi.realtime.wire import Unpacker, WireError
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS, ServerOptions
-from turbopi.serve.real_time import Plan, RealTime
+from turbopi.serve.real_time import MAX_SESSIONS, Plan, RealTime
 from turbopi.serve.scheduling.schedule import PRIORITIES, Priority, Request
 from turbopi.support.errors import ObservationError
 
@@ -125,10 +127,11 @@ class Refusal(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The map to send, with "server_timing", and what the request said about scheduling."""
+    """The map to send, with "server_timing", what the request said about scheduling, and the notes for the log."""
 
     result: dict[str, Any]
     scheduling: "SchedulingOptions"
+    notes: Sequence[Note] = ()
 
 
 class ClientLeft(Exception):
@@ -189,6 +192,7 @@ class RequestHandler:
     ) -> None:
         self._calls, self._real_time, self._metrics, self._options = calls, real_time, metrics, options
         self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
+        self._watches: OrderedDict[str, Watch] = OrderedDict()  # of named sessions, the last used one at the end
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
     async def handle(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> Reply | Refusal:
@@ -205,7 +209,8 @@ class RequestHandler:
         failed = first_error(request, results)
         self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
         if failed is None:
-            return Reply(self._answer(request, results), request.scheduling)
+            noted = self._note(request, results)
+            return Reply(self._answer(request, results), request.scheduling, noted)
         if failed.error == "policy":
             raise PolicyFailed(failed.text)
         assert failed.error is not None
@@ -265,6 +270,36 @@ class RequestHandler:
             disconnected.remove_done_callback(cancel)
             self._real_time.release(plan)
 
+    def _note(self, request: ClientRequest, results: Sequence[Result]) -> list[Note]:
+        """Put notes in place of the readings of a request's answers. Returns those that the log hasn't said yet."""
+        batch, new = request.scheduling.batch, []
+        watch = self._watch_of(request) if batch is None else request.connection.batch_watch
+        for result in results:
+            assert result.answer is not None
+            reading = result.answer.get(READING)
+            if not isinstance(reading, Reading):
+                continue
+            del result.answer[READING]
+            if not (notes := watch.notes(reading)):
+                continue
+            result.answer[NOTES] = [note.plain for note in notes]
+            new += watch.to_log(notes)
+            for note in notes:
+                self._metrics.note(note.kind)
+        return new
+
+    def _watch_of(self, request: ClientRequest) -> Watch:
+        """Of the robot: of its session, if that has a name, else of its connection."""
+        name, watch = request.plan.name, request.connection.watch
+        if name is not None:
+            watch = self._watches.setdefault(name, Watch())
+            self._watches.move_to_end(name)
+            if len(self._watches) > MAX_SESSIONS:
+                self._watches.popitem(last=False)
+        if request.plan.requested.reset:
+            watch.reset()
+        return watch
+
     def _answer(self, request: ClientRequest, results: Sequence[Result]) -> dict[str, Any]:
         """The map to send, of results that all have actions; with "server_timing"."""
         if request.scheduling.batch is None:
@@ -278,7 +313,9 @@ class RequestHandler:
         runs = list({result.run: result for result in results}.values())
         server_timing = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
         timing = sum_timings([run.answer.get(TIMING, {}) for run in runs if run.answer is not None])
-        return {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
+        stacked = {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
+        noted = [{**note.plain, "row": row} for row, answer in enumerate(answers) for note in notes_in(answer)]
+        return {**stacked, NOTES: noted[:MOST_NOTES]} if noted else stacked
 
 
 def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
@@ -463,9 +500,9 @@ def _row_value(value: Any, index: int) -> Any:
 def stack_answers(answers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The rows' answers as one map: arrays of one shape as [B, …], maps by their keys, all else as lists.
 
-    Their `policy_timing` is left out: rows of one run share it.
+    Their `policy_timing` is left out, as rows of one run share it, and their notes.
     """
-    keys = [key for key in answers[0] if key != TIMING and all(key in answer for answer in answers)]
+    keys = [key for key in answers[0] if key not in (TIMING, NOTES) and all(key in answer for answer in answers)]
     return {key: _stack([answer[key] for answer in answers]) for key in keys}
 
 

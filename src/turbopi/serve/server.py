@@ -318,7 +318,7 @@ class PolicyServer:
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
                 continue
-            result, scheduling = reply
+            result, scheduling, notes = reply
             if previous_total is not None:
                 result["server_timing"]["prev_total_ms"] = previous_total * 1e3
             await connection.send(pack(result))
@@ -327,6 +327,10 @@ class PolicyServer:
             self.metrics.request_seconds.observe(finished - received)
             if scheduling.firm:
                 self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
+            for note in notes:
+                self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
+                if self._live is not None:
+                    self._live.failed(note.kind, f"{peer(connection)}: {note.text}")
             previous_total = finished - started  # with the wait for the request, as openpi counts it
             if self._live is not None:
                 assert isinstance(message, bytes)

@@ -44,12 +44,17 @@ _GROUPS: dict[str, list[ActionGroup]] = {
 }
 
 
+def known_groups(robot: str) -> list[ActionGroup]:
+    """The groups of a robot that comes with Turbo-Pi; none for others."""
+    return _GROUPS.get(robot, [])
+
+
 def action_groups(robot: str, dims: int, names: Sequence[str] | None = None) -> list[ActionGroup]:
     """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible.
 
     names   of an unknown robot's actions, where a dataset has them
     """
-    groups = _GROUPS.get(robot, [])
+    groups = known_groups(robot)
     if sum(len(group.names) for group in groups) == dims:
         return groups
     eights = [range(start, min(start + 8, dims)) for start in range(0, dims, 8)]

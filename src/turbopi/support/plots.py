@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,9 +16,21 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
 
 _DPI = 110
+_NEAR = 0.25  # widths of a training range: beyond, a value is outside
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 MEASURED, SOLVED, BOUND, MUTED = "#3b6fb6", "#2f8f5b", "#b00020", "#9aa0a6"
 _GRIPPERS = {"gripper": "C9", "left": "C9", "right": "C8"}  # as no axis and no joint, which have C0 to C7
+
+
+class Range(Protocol):
+    """Where the training data lie: float64[d] each, and (name, unit) of each dimension."""
+
+    @property
+    def labels(self) -> Sequence[tuple[str, str]]: ...
+    @property
+    def low(self) -> np.ndarray: ...
+    @property
+    def high(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -26,6 +38,7 @@ class Row:
     """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines.
 
     legend   what those two are called
+    state  of the robot, float[s]
     """
 
     heading: str
@@ -33,6 +46,7 @@ class Row:
     actions: np.ndarray
     oracle: np.ndarray | None = None
     expert: np.ndarray | None = None
+    state: np.ndarray | None = None
     legend: tuple[str, str] = ("float32 reference", "expert")
 
 
@@ -44,25 +58,34 @@ def plot_chunks(
     title: str,
     random_weights: bool,
     names: Sequence[str] | None = None,
+    state_range: Range | None = None,
+    action_range: Range | None = None,
 ) -> None:
-    """Write a PNG with one row an observation: its images, then its action chunk by groups of one unit.
+    """Write a PNG with one row an observation: its images, its state, then its action chunk by groups of one unit.
 
-    A group's axis is the same in every row; `names` as for `action_groups`. Raises as `write_figure` does.
+    A group's axis is the same in every row. The state is drawn where its training range is known; that of an action is
+    a bar behind the last step; `names` as for `action_groups`. Raises as `write_figure` does.
     """
+    if names is None and action_range is not None:
+        names = [name for name, _ in action_range.labels]
     groups = action_groups(robot, rows[0].actions.shape[1], names)
     num_images = max(len(row.camera_images) for row in rows)
     limits = [_limits(group, rows) for group in groups]
-    widths = [1.0] * num_images + [1.45] * len(groups)
+    drawn_state = state_range if state_range is not None and len(state_range.low) else None
+    panels = num_images + (drawn_state is not None)
+    widths = [1.0] * num_images + [1.3] * (panels - num_images) + [1.45] * len(groups)
     figure = Figure(figsize=(0.8 + 2.45 * sum(widths), 0.9 + 2.75 * len(rows)), dpi=_DPI, layout="constrained")
     if random_weights:
         title += "\nrandom weights: the actions mean nothing"
     figure.suptitle(as_text(title), fontsize=14, fontweight="bold", color=BOUND if random_weights else "black")
     for row, panel in zip(rows, np.atleast_1d(np.array(figure.subfigures(len(rows), 1))), strict=True):
         panel.suptitle(as_text(row.heading), fontsize=10.5, x=0.01, ha="left")
-        axes = np.atleast_1d(panel.subplots(1, num_images + len(groups), width_ratios=widths))
+        axes = np.atleast_1d(panel.subplots(1, panels + len(groups), width_ratios=widths))
         _draw_images(axes[:num_images], row.camera_images)
-        for ax, group, span in zip(axes[num_images:], groups, limits, strict=True):
-            _draw_group(ax, group, row)
+        if drawn_state is not None and row.state is not None:
+            _draw_state(axes[num_images], drawn_state, row.state)
+        for ax, group, span in zip(axes[panels:], groups, limits, strict=True):
+            _draw_group(ax, group, row, action_range)
             ax.set_ylim(span)
     write_figure(file, figure)
 
@@ -109,7 +132,28 @@ def _draw_images(axes: Any, camera_images: dict[str, np.ndarray]) -> None:
         ax.set_title(as_text(camera), fontsize=9)
 
 
-def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
+def _draw_state(ax: Axes, known: Range, state: np.ndarray) -> None:
+    """Each value where it lies in its training range, which reaches from 0 to 1 on this axis, and what it is."""
+    few = min(len(state), len(known.low))
+    low, width = known.low[:few], known.high[:few] - known.low[:few]
+    place = np.divide(state[:few] - low, width, out=np.full(few, 0.5), where=width > 0)
+    places = np.arange(few)
+    ax.barh(places, 1.0, color="0.85", height=0.7)
+    for at, where in enumerate(place):
+        off = not -_NEAR <= where <= 1 + _NEAR
+        ax.plot(np.clip(where, -1, 2), at, marker="o" if -1 <= where <= 2 else "X", color=BOUND if off else MEASURED)
+    texts = [
+        f"{name}  {value:.3g} {unit if len(unit) < 6 else ''}".rstrip()
+        for (name, unit), value in zip(known.labels, state[:few], strict=False)
+    ]
+    ax.set_yticks(places, [as_text(text) for text in texts], fontsize=7)
+    ax.set_xticks([0, 1], ["low", "high"], fontsize=8)
+    ax.set_xlim(-1.15, 2.15)
+    ax.invert_yaxis()
+    ax.set_title("state, in the training range", fontsize=9)
+
+
+def _draw_group(ax: Axes, group: ActionGroup, row: Row, known: Range | None) -> None:
     steps = np.arange(len(row.actions))
     dot: dict[str, Any] = {
         "marker": "o",
@@ -122,6 +166,9 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
     for number, (index, name) in enumerate(group.names.items()):
         color = _GRIPPERS.get(name, f"C{number}")
         handles += ax.plot(steps, row.actions[:, index], color=color, linewidth=1.6, label=name)
+        if known is not None and index < len(known.low):
+            behind = len(steps) + 0.02 * len(steps) * (number + 1)
+            ax.plot([behind] * 2, [known.low[index], known.high[index]], color=color, linewidth=3, alpha=0.5)
         if row.oracle is not None:
             ax.plot(steps[: len(row.oracle)], row.oracle[: len(steps), index], color=color, **dot)
         if row.expert is not None:

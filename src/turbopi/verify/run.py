@@ -97,7 +97,7 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
         warmup_seconds=round(warmup, 3),
         gpu_bytes=memory,
         observations=reference.describe(plan, quantization),
-        weights=WeightsDocument(path, checkpoint.format, checkpoint.format == "random", fingerprint),
+        weights=WeightsDocument(path, checkpoint.format, checkpoint.random is not None, fingerprint),
         policy=details,
         provenance=about,
     )

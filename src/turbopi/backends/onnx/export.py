@@ -91,6 +91,7 @@ def export_onnx(
             "kind": model.config.kind,
             "precision": "f32" if calibration is None else "fp8 (E4M3) in the prefix's MLPs, f32 elsewhere",
             **({} if calibration is None else {"calibration": calibration.about()}),
+            **({} if checkpoint is None or checkpoint.random is None else {"random_weights": checkpoint.random}),
             "opset": OPSET,
             "sizes": asdict(model.config),
             "graphs": signatures,

@@ -63,6 +63,7 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     device: str = "auto"
     tokenizer: str | None = None
     default_prompt: str | None = None
+    out_of_range: str = "warn"
     strict: bool = False
     warmup: bool = True
     replicas: int | None = None
@@ -105,6 +106,7 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             default_prompt=self.default_prompt,
             robot=self.robot,
             strict=self.strict,
+            out_of_range=self.out_of_range,  # type: ignore[arg-type]  # checked there
         )
 
     def fleet(self) -> FleetOptions:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import msgspec
@@ -19,6 +19,7 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
+from turbopi.realtime.messages import notes_in
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.limited_log import peer
 from turbopi.serve.metrics import Metrics
@@ -65,6 +66,7 @@ class _Robot:
     preview: Preview | None = None
     previewed: float = -np.inf  # the event loop's time
     pending: bool = False
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,7 @@ class Live:
         robot = self._robots[connection]
         robot.calls += 1
         robot.last = time.time()
+        robot.notes = [clean(note.text) for note in notes_in(reply)]
         timing = _timing(reply, seconds)
         self._timings.append(timing)
         if not self._watchers or robot.pending or len(self._pending) >= MAX_PENDING or self._closed.is_set():
@@ -162,7 +165,7 @@ class Live:
             task.add_done_callback(self._pending.discard)
 
     def failed(self, kind: str, text: str) -> None:
-        """A request got no actions: `text` is what the client was sent."""
+        """A request got no actions, and `text` is what the client was sent; or the log has a note."""
         self._troubles.append(Trouble(time.time(), kind, clean(text)))
 
     async def _make_preview(
@@ -231,7 +234,7 @@ class Live:
 
 def _robot_frame(robot: _Robot, sent: Mapping[int, int]) -> RobotFrame:
     new = robot.preview if robot.preview is not None and robot.preview.number != sent.get(robot.id) else None
-    return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new)
+    return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new, robot.notes)
 
 
 def _timing(reply: Mapping[str, object], seconds: float) -> Timing:

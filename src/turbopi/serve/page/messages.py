@@ -56,7 +56,7 @@ class Preview(Struct, frozen=True):
 
 
 class RobotFrame(Struct, frozen=True):
-    """A connected robot. `preview` is its last call if this watcher hasn't had it yet."""
+    """A connected robot. `preview`: its last call, if this watcher hasn't had it yet; `notes`: of its last answer."""
 
     id: int
     address: str
@@ -64,6 +64,7 @@ class RobotFrame(Struct, frozen=True):
     calls: int
     last: float | None
     preview: Preview | None = field(default=None, name="look")
+    notes: list[str] = field(default_factory=list)
 
 
 class StageTimes(Struct, frozen=True):
@@ -81,10 +82,10 @@ class StageTimes(Struct, frozen=True):
 
 
 class Trouble(Struct, frozen=True):
-    """A request that got no actions."""
+    """A request that got no actions, or a note."""
 
     time: float
-    error: str  # its kind, as in turbopi_errors_total
+    error: str  # its kind, as in turbopi_errors_total or turbopi_notes_total
     text: str
 
 

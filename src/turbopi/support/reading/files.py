@@ -37,7 +37,7 @@ class _Short(reprlib.Repr):
 shown = _Short().repr
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: Exception | str) -> str:
     """What a library says of damage, which may quote all of it."""
     return "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error)[:2000].split())[:400])
 

@@ -79,7 +79,7 @@ def run(setup: Setup) -> Report:
         verdict="; ".join(f"{o.backend} on {o.observations}: {significant(o.worst_relative)}" for o in found) + ".",
         would_change="A checkpoint with larger outliers.",
         not_run=["In closed loop: `turbopi compare` does that."],
-        data={"actions": [plain_document(one) for one in found], "random_weights": checkpoint.format == "random"},
+        data={"actions": [plain_document(one) for one in found], "random_weights": checkpoint.random is not None},
     )
 
 

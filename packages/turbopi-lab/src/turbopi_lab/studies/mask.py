@@ -217,7 +217,7 @@ def run(setup: Setup) -> Report:
         data={
             "mask": [plain_document(one) for one in found],
             "closed_loop": [plain_document(cell) for cell in cells],
-            "random_weights": checkpoint.format == "random",
+            "random_weights": checkpoint.random is not None,
         },
     )
 
