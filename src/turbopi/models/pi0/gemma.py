@@ -70,7 +70,7 @@ class Gemma(nn.Module):
     def __init__(self, model: ModelConfig, config: GemmaConfig, *, vocab_size: int | None, adaptive: bool) -> None:
         super().__init__()
         if vocab_size is not None:
-            self.embed_tokens = nn.Embedding.from_pretrained(torch.empty(vocab_size, config.width))
+            self.embed_tokens = nn.Embedding.from_pretrained(torch.empty(vocab_size, config.width))  # type: ignore[no-untyped-call]
         layers = (Layer(config, model.rms_norm_eps, adaptive) for _ in range(config.depth))
         self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
         self.norm = (AdaRMSNorm if adaptive else RMSNorm)(config.width, model.rms_norm_eps)

@@ -53,7 +53,7 @@ class VisionTower(nn.Module):
         super().__init__()
         self.config = config
         self.patch_embedding = nn.Conv2d(3, config.width, config.patch_size, config.patch_size)
-        self.position_embedding = nn.Embedding.from_pretrained(torch.empty(config.num_tokens, config.width))
+        self.position_embedding = nn.Embedding.from_pretrained(torch.empty(config.num_tokens, config.width))  # type: ignore[no-untyped-call]
         self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.depth))
         self.post_layernorm = nn.LayerNorm(config.width, eps=config.layer_norm_eps)
 

@@ -144,7 +144,7 @@ class Text(nn.Module):
     def __init__(self, config: SmolVLAConfig) -> None:
         super().__init__()
         text = config.text
-        self.embed_tokens = nn.Embedding.from_pretrained(torch.empty(text.vocab_size, text.width))
+        self.embed_tokens = nn.Embedding.from_pretrained(torch.empty(text.vocab_size, text.width))  # type: ignore[no-untyped-call]
         layers = (Layer(text.width, text.mlp_dim, text.width, config) for _ in range(text.depth))
         self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
 
