@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.preprocess import images
-from turbopi.preprocess.images import RESIZES, all_fitted, fitted, resize_into, resize_unit_into, resize_with_pad
+from turbopi.preprocess.images import WAYS, all_fitted, fitted, resize_into, resize_unit_into, resize_with_pad
 from turbopi.robots.images import parse_chw_image, parse_image, parse_unit_image, to_uint8
 from turbopi.support.errors import ObservationError
 
@@ -61,7 +61,7 @@ SIZES = ((480, 640), (720, 1280), (1080, 1920), (640, 480), (211, 1999), (224, 4
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cores", [1, 2, 3, 16])
-@pytest.mark.parametrize("way", RESIZES)
+@pytest.mark.parametrize("way", WAYS)
 def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
     monkeypatch: pytest.MonkeyPatch, way: Any, cores: int
 ) -> None:

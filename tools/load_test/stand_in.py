@@ -61,6 +61,7 @@ class SleepingBackend(Backend):
 
     name: ClassVar[str] = "sleeping"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    begins: ClassVar[bool] = True
     runs_batches: ClassVar[bool] = True
     gpu: ClassVar[str] = "none"
 

@@ -26,7 +26,7 @@ from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
 from turbopi.checkpoint.source import Piece, Shape, random_note, row_ranges
-from turbopi.config import ModelConfig, PolicyConfig, preset
+from turbopi.config import PRESETS, ModelConfig, PolicyConfig, preset
 from turbopi.models import RANDOM, parameter_shapes
 from turbopi.support.errors import ConfigError
 
@@ -79,7 +79,11 @@ def random_checkpoint(
     """
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise ConfigError(f"seed is {seed!r}; expected a whole number in [0, 2**32)")
-    config = preset_name if isinstance(preset_name, PolicyConfig) else RANDOM.get(preset_name) or preset(preset_name)
+    config = (
+        preset_name
+        if isinstance(preset_name, PolicyConfig)
+        else PRESETS.get(preset_name) or RANDOM.get(preset_name) or preset(preset_name)
+    )
     made_of = f"random weights, preset {config.name}, seed {seed}"
     if config_source != "auto":
         settings = read_settings(config_source, Path())

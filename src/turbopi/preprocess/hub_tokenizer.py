@@ -5,6 +5,7 @@ from typing import Any
 
 from turbopi.preprocess.tokenizer_json import TOKENIZER_CONFIG
 from turbopi.support.errors import TokenizerError
+from turbopi.support.installation import install_command
 from turbopi.support.reading import one_line, read_bytes, read_json, shown
 
 _MAX_BYTES = 64 * 2**20
@@ -23,7 +24,7 @@ class HubTokenizer:
             import tokenizers
         except ImportError as error:
             raise TokenizerError(
-                f"{file} needs the `tokenizers` library: pip install 'turbopi[smolvla]' (or pip install tokenizers)"
+                f"{file} needs the library tokenizers, which isn't installed: {install_command('smolvla')}"
             ) from error
         content = read_bytes(file, TokenizerError, limit=_MAX_BYTES)
         try:

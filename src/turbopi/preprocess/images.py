@@ -46,6 +46,8 @@ RESIZES: dict[ImageResize, _Way] = {
     "openpi": _Way(False, 0),
     "lerobot": _Way(True, -1),
     "lerobot_0.4": _Way(True, -3, low=-1.0),
+}  # those that the engine's kernels know, too
+WAYS: dict[ImageResize, _Way] = RESIZES | {
     "lerobot_smolvla": _Way(True, -1, low=-math.inf, high=math.inf, centred=False),
 }
 
@@ -55,7 +57,7 @@ def fitted(camera_image: np.ndarray, size: int, resize: ImageResize) -> np.ndarr
 
     float32 is in [0, 1], and LeRobot's ways alone take it. Raises ObservationError if the image is too narrow.
     """
-    way = RESIZES[resize]
+    way = WAYS[resize]
     if not way.float_images and camera_image.shape == (size, size, 3) and camera_image.flags.c_contiguous:
         return camera_image
     out: np.ndarray = np.empty((size, size, 3), np.float32 if way.float_images else np.uint8)
@@ -76,7 +78,7 @@ def all_fitted(camera_images: Sequence[np.ndarray], size: int, resize: ImageResi
     has PyTorch's.
     """
     large = max((one.size for one in camera_images), default=0) > LARGE
-    if _cores() == 1 or len(camera_images) == 1 or RESIZES[resize].float_images or not large:
+    if _cores() == 1 or len(camera_images) == 1 or WAYS[resize].float_images or not large:
         return [fitted(one, size, resize) for one in camera_images]
     for one in camera_images:
         placement(one.shape, (size, size, 3))  # refuses before anything starts
@@ -165,7 +167,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, way: _Way = RESIZES["le
 
 def fit_unit(images: Tensor, size: tuple[int, int], resize: ImageResize) -> Tensor:
     """LeRobot's ways on any device: float32[B, h, w, 3] in [0, 1] to float32[B, *size, 3] in [-1, 1]."""
-    way = RESIZES[resize]
+    way = WAYS[resize]
     out = torch.full((len(images), *size, 3), float(way.padding), device=images.device)
     if out.shape == images.shape:
         return images * 2 - 1

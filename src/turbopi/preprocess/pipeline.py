@@ -15,7 +15,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs
-from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
+from turbopi.preprocess.images import RESIZES, WAYS, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
 from turbopi.preprocess.relative_actions import add_state, reanchored
 from turbopi.preprocess.robot_checks import (
@@ -110,7 +110,7 @@ class Pipeline:
         scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
         self._adds_raw_state = mask is not None and scaled_by_lerobot
         self._image_shape = (config.model.image_size,) * 2
-        self._float_images = RESIZES[config.image_resize].float_images
+        self._float_images = WAYS[config.image_resize].float_images
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
         self.before_vision: tuple[Callable[[Incoming], None], ...] = (
             self._read_observation,
@@ -388,13 +388,11 @@ class Pipeline:
         family = family_of(config.model)
         if config.discrete_state_input and family.reads_state:
             raise ConfigError(
-                f"{config.name}: discrete_state_input is true, but {family.label} doesn't read the state from the "
-                "prompt; set it to false"
+                f"{config.name}: only Pi0.5 reads the state from the prompt; {family.label} needs it set to false"
             )
-        if config.image_resize not in RESIZES:
-            raise ConfigError(
-                f"{config.name}: image_resize is {config.image_resize!r}; expected {' or '.join(RESIZES)}"
-            )
+        ways = RESIZES if family.planned else WAYS
+        if config.image_resize not in ways:
+            raise ConfigError(f"{config.name}: image_resize is {' or '.join(ways)}, not {config.image_resize!r}")
         dims = (("state", robot.state_dim, self.state_scale), ("actions", robot.action_dim, self.action_scale))
         if robot.delta_mask is not None and len(robot.delta_mask) > limit:
             raise ConfigError(

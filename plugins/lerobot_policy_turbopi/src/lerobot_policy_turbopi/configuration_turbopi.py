@@ -109,7 +109,7 @@ class TurboPiConfig(PreTrainedConfig):
         if described.type not in KINDS:
             raise CheckpointError(
                 f"{self.checkpoint} is a LeRobot checkpoint of type {described.type!r}; Turbo-Pi runs "
-                f"{', '.join(map(repr, KINDS))}"
+                f"{' and '.join(map(repr, KINDS))}"
             )
         described.validate_features()  # adds the empty cameras, and features that the file leaves to defaults
         return described

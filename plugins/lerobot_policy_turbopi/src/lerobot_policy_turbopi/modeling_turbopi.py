@@ -28,6 +28,7 @@ from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.policy.call_options import checked_steps
 from turbopi.preprocess.images import fit_unit
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 from turbopi.support.reading import file_inside, read_json
 
@@ -235,7 +236,7 @@ class TurboPiPolicy(PreTrainedPolicy):
             raise ObservationError(
                 f"the batch has none of the checkpoint's cameras, {wanted}; it has {', '.join(batch)}"
             )
-        size, resize = self.config.image_resolution, self._local.config.image_resize
+        size, model = self.config.image_resolution, self._local.config.model
         camera_images = []
         for key in present:
             camera_image = batch[key].to(torch.float32)
@@ -243,17 +244,18 @@ class TurboPiPolicy(PreTrainedPolicy):
                 camera_image = camera_image.permute(0, 2, 3, 1)
             if camera_image.shape[1:3] == size:
                 camera_images.append(camera_image * 2 - 1)
-            elif resize == "lerobot":
+            elif family_of(model).planned:
                 camera_images.append(resize_with_pad_torch(camera_image, *size) * 2 - 1)
             else:
-                camera_images.append(fit_unit(camera_image, size, resize))
+                camera_images.append(fit_unit(camera_image, size, self._local.config.image_resize))
         return torch.stack(camera_images, dim=1)
 
     def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
         """float32[B, state_dim], padded, of a family that reads it as numbers. Pi0.5 has it in the prompt."""
         model = self._local.config.model
-        state = torch.zeros(rows, model.state_dim)
-        if family_of(model).reads_state:
+        family = family_of(model)
+        state = torch.zeros(rows, self.config.max_action_dim if family.planned else model.state_dim)
+        if family.reads_state:
             given = batch[OBS_STATE]
             state[:, : given.shape[-1]] = given
         return state
@@ -283,7 +285,8 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         quantization=config.quantization,
         num_denoising_steps=config.num_inference_steps,
         device=config.device or "auto",
-        tokenizer=_Words(),  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
+        # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
+        tokenizer=TINY_TOKENIZER if family_of(ours.model).paligemma else _Words(),
     )
     described = policy.metadata
     logger.info(
