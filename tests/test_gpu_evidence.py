@@ -111,7 +111,7 @@ def test_files_of_the_host_are_not_in_the_fingerprint(module: str) -> None:
 
 
 def test_a_result_file_is_named_by_gpu_and_date() -> None:
-    assert gpu_evidence.result_file("NVIDIA H200", "2026-11-28").name == "h200_2026-11-29_gpu_check.json"
+    assert gpu_evidence.result_file("NVIDIA H200", "2026-11-28").name == "h200_2026-11-28_gpu_check.json"
     assert (
         gpu_evidence.result_file("NVIDIA GeForce RTX 4090", "2027-01-02").name == "rtx_4090_2027-01-02_gpu_check.json"
     )
