@@ -310,7 +310,9 @@ class _Cold:
     def pipelined(self) -> bool:
         return self._policy.pipelined
 
-    gives_readings = True
+    @property
+    def gives_readings(self) -> bool:
+        return getattr(self._policy, "gives_readings", False)  # a policy of one's own may have none
 
     def infer(self, obs: dict[str, object], /, **arguments: Any) -> dict[str, object]:
         return self._policy.infer(obs, **arguments)
