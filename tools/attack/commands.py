@@ -23,6 +23,7 @@ from attack.zygote import Job, Zygote, fault
 
 SECONDS, MEMORY_MB = 120.0, 4000.0
 SERVE_SECONDS = 12.0  # a server that comes up in spite of its options is ended then
+FLEET_SECONDS = 60.0  # so is one with --ray, which starts a cluster first
 
 _TINY = ("--random-weights", "pi05_tiny")
 _QUICK = (*_TINY, "--steps", "1")
@@ -162,7 +163,9 @@ def commands(seed: int, count: int, folder: Path, found: Found, tick: Tick) -> N
         for number, line in enumerate(command_lines(seed, count, parameters())):
             shutil.rmtree(here, ignore_errors=True)
             furnish(here)
-            seconds = SERVE_SECONDS if line[0] == "serve" else SECONDS
+            seconds = SECONDS
+            if line[0] == "serve":
+                seconds = FLEET_SECONDS if "--ray" in line else SERVE_SECONDS
             arguments = [argument.replace("{here}", str(here)) for argument in line]
             if any("\0" in argument for argument in arguments):
                 continue
