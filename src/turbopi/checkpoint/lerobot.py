@@ -27,6 +27,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
     UNNORMALIZER,
     Pipelines,
 )
+from turbopi.checkpoint.names import Names, PiNames
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
@@ -64,6 +65,7 @@ class LeRobotFolder:
     """
 
     keys: ClassVar[Keys] = PI
+    own_settings: ClassVar[frozenset[str]] = frozenset()  # keys of a turbopi.json that are for this type alone
 
     def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
@@ -78,6 +80,11 @@ class LeRobotFolder:
         self.written_by = versions.detect(self.config.values, untied=untied)
         chosen = settings.values.get("lerobot_semantics", "auto")
         self.semantics: versions.Semantics = (self.written_by or "0.6") if chosen == "auto" else chosen
+
+    @classmethod
+    def names(cls, folder: Path) -> Names:
+        """How the weights of such a folder are named."""
+        return PiNames()
 
     def policy_config(self) -> PolicyConfig:
         """What the folder says, with a turbopi.json's values over it. A preset would be a second description."""

@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from turbopi.checkpoint.lerobot import LeRobotFolder
+from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE
+from turbopi.checkpoint.names import Names
 from turbopi.config import LIMITS, Normalization, PolicyConfig
 from turbopi.models import Family
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
@@ -48,6 +49,12 @@ class SmolVLAFolder(LeRobotFolder):
     """As `LeRobotFolder`. vlm_source: where the vision-language model's sizes are from, for messages."""
 
     keys: ClassVar[Keys] = SMOLVLA
+    own_settings: ClassVar[frozenset[str]] = frozenset({"vlm"})
+
+    @classmethod
+    def names(cls, folder: Path) -> Names:
+        config = Fields(read_json(folder / CONFIG), folder / CONFIG)
+        return SmolVLANames(config.integer("num_vlm_layers", 1, LIMITS["depth"], default=16))
 
     def _described(self) -> PolicyConfig:
         return PolicyConfig(

@@ -8,9 +8,8 @@ from typing import Any
 from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
 from turbopi.checkpoint.lerobot import LeRobotFolder, policy_type
-from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder, SmolVLANames
+from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder
 from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
-from turbopi.checkpoint.names import Names
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
@@ -20,10 +19,9 @@ from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, r
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import LIMITS, Kind, ModelConfig, PolicyConfig
-from turbopi.models import parameter_shapes
+from turbopi.config import Kind, ModelConfig, PolicyConfig
+from turbopi.models import FAMILIES, parameter_shapes
 from turbopi.support.errors import CheckpointError, ConfigError
-from turbopi.support.reading import Fields, read_json
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
@@ -125,11 +123,20 @@ def _source(location: Location, settings: Settings) -> WeightSource:
         raise ConfigError(f"{settings.source}: base_model only applies to adapters, and {location.weights} has weights")
     if location.format == "onnx":
         return GraphSource(open_export(location.folder))
-    prefix = "model." if location.format == "lerobot" else ""
-    source = TorchSource(location.weights, format=location.format, prefix=prefix, names=_names(location))
+    if location.format == "lerobot":
+        source = _lerobot_weights(location.weights, location)
+    else:
+        source = TorchSource(location.weights, format=location.format)
     if (location.weights / ADAPTER).is_file():
         source.notes.append(f"{ADAPTER} isn't followed: there are whole weights, and no use_peft = true in config.json")
     return source
+
+
+def _lerobot_weights(folder: Path, location: Location) -> TorchSource:
+    """In `folder`, named as the type of policy at `location` names them."""
+    return TorchSource(
+        folder, format="lerobot", prefix="model.", names=_lerobot_folder(location).names(location.folder)
+    )
 
 
 def _open_adapter(location: Location, settings: Settings) -> WeightSource:
@@ -138,39 +145,38 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
     if base.adapter or base.format == "openpi_jax":
         what = "an adapter itself: merge it" if base.adapter else "openpi's JAX format: convert it (turbopi convert)"
         raise CheckpointError(f"the base model of {location.folder} is {base.folder}, which is {what} first")
-    weights = TorchSource(base.weights, format="lerobot", prefix="model.", names=_names(location))
+    weights = _lerobot_weights(base.weights, location)
     weights.notes[:0] = base.notes
     return PeftSource(location.folder, weights, base.folder)
 
 
-_READERS: Mapping[str, type[LeRobotFolder]] = {"smolvla": SmolVLAFolder}  # by type of policy; others: LeRobotFolder
+_READERS: Mapping[Kind, type[LeRobotFolder]] = {"smolvla": SmolVLAFolder}  # by type of policy; others: LeRobotFolder
 
 
 def _lerobot_folder(location: Location) -> type[LeRobotFolder]:
-    return _READERS.get(policy_type(location.folder), LeRobotFolder)
+    kind = _own_kind(location)
+    return LeRobotFolder if kind is None else _READERS[kind]
 
 
-def _names(location: Location) -> Names | None:
-    """How the weights are named, where that isn't Pi0's way."""
-    if location.format != "lerobot" or _lerobot_folder(location) is not SmolVLAFolder:
-        return None
-    config = Fields(read_json(location.folder / "config.json"), location.folder / "config.json")
-    return SmolVLANames(config.integer("num_vlm_layers", 1, LIMITS["depth"], default=16))
+def _own_kind(location: Location) -> Kind | None:
+    """The family of a LeRobot folder whose weights aren't named as Pi0's are, by its config.json."""
+    kind = policy_type(location.folder)
+    return next((one for one in _READERS if one == kind), None)
 
 
 def _kind(location: Location, source: WeightSource) -> Kind:
     """The family, by the weights; where their names aren't Pi0's, by LeRobot's config.json."""
-    if location.format == "lerobot" and (reader := _lerobot_folder(location)) is not LeRobotFolder:
-        return reader(location.folder, _without_policy("auto", location)).kind
-    return detect_kind(source, location.weights)
+    own = _own_kind(location) if location.format == "lerobot" else None
+    return own or detect_kind(source, location.weights)
 
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
     untied, reader = getattr(source, "untied", False), _lerobot_folder(location)
     if reader is LeRobotFolder:
         detect_kind(source, location.weights)  # says what weights of no family look like
-    if "vlm" in settings.values and reader is not SmolVLAFolder:
-        raise ConfigError(f"{settings.source}: vlm only applies to SmolVLA")
+    for kind, other in _READERS.items():
+        if other is not reader and (keys := settings.values.keys() & other.own_settings):
+            raise ConfigError(f"{settings.source}: {min(keys)} only applies to {FAMILIES[kind].label}")
     folder = reader(location.folder, settings, untied=untied)
     policy = _with_sizes(folder.policy_config(), source, settings, location)
     if policy.model.kind != folder.kind:
