@@ -17,7 +17,7 @@ from turbopi.support.action_groups import action_groups
 
 NEVER_MOVED = 2e-6  # of a unit: the epsilons of normalising, where the statistics have one value alone
 OTHER_MOMENTS = 8  # draws of the control "another moment's chunk"
-OUTSIDE = 2.0  # ranges of the training beside its middle, beyond which numbers are told
+OUTSIDE = 2.0  # ranges of the training beside its middle, beyond which numbers are noted
 OTHERS, MEAN, HELD = "another moment's chunk", "the mean action", "the action before, held"
 
 

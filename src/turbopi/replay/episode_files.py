@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.replay.episodes import ACTIONS, PROMPT, Dataset, Episode
+from turbopi.replay.episodes import ACTIONS, PROMPT, ActionByStep, Episode
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.reading import Npz, listing, one_line
 from turbopi.support.reading.images import decode_image
@@ -33,7 +33,7 @@ _STATE = "observations/qpos"
 _IMAGES = "observations/images/"
 
 
-class _EpisodeFiles(Dataset):
+class _EpisodeFiles(ActionByStep):
     """An episode a file, each opened as {key: array of time}."""
 
     endings: tuple[str, ...]

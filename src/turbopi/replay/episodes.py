@@ -60,11 +60,27 @@ class Dataset(ABC):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: list[str] = []
-        self._actions = lru_cache(maxsize=4)(self._checked_actions)
 
     @property
     @abstractmethod
     def episodes(self) -> Sequence[Episode]: ...
+
+    @abstractmethod
+    def moments(self, episode: Episode, steps: Sequence[int], horizon: int) -> Iterator[Moment]:
+        """The moments at some steps, which rise. Raises ObservationError, naming the file, for what can't be read."""
+        ...
+
+    def names_of(self, key: str) -> tuple[str, ...] | None:
+        """The name of each number of an observation's key; None: not known."""
+        return None
+
+
+class ActionByStep(Dataset):
+    """Episodes with one action recorded at each step: a moment's chunk is made of those from it on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._actions = lru_cache(maxsize=4)(self._checked_actions)
 
     @abstractmethod
     def read_actions(self, episode: Episode) -> np.ndarray:
@@ -76,12 +92,7 @@ class Dataset(ABC):
         """The observations at some steps, which rise. Raises ObservationError."""
         ...
 
-    def names_of(self, key: str) -> tuple[str, ...] | None:
-        """The name of each number of an observation's key; None: not known."""
-        return None
-
     def moments(self, episode: Episode, steps: Sequence[int], horizon: int) -> Iterator[Moment]:
-        """The moments at some steps, which rise. Raises ObservationError, naming the file, for what can't be read."""
         actions = self._actions(episode)
         for step, observation in zip(steps, self.observations(episode, steps), strict=True):
             previous = actions[step - 1] if step else None

@@ -10,7 +10,7 @@
           meta/episodes/*/*.parquet    a row an episode: length, data/chunk_index, data/file_index, and for each video
                                        videos/KEY/chunk_index, file_index, from_timestamp, to_timestamp
           meta/stats.json              {feature: {"min", "max", …}}
-          data_path                    {chunk_index}, {file_index}: several episodes a file, told apart by episode_index
+          data_path                    {chunk_index}, {file_index}: several episodes a file, by episode_index
           video_path                   the same and {video_key}; an episode begins at its from_timestamp
 
 A feature of dtype `image` lies in the parquet file: {"bytes", "path"}, of PNG or JPEG. One of dtype `video` is looked
@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.replay.episodes import PROMPT, Dataset, Episode
+from turbopi.replay.episodes import PROMPT, ActionByStep, Episode
 from turbopi.replay.video import frames_at
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.installation import install_command
@@ -51,7 +51,7 @@ _MAX_BYTES = 512 * 2**20  # of metadata: episodes' statistics of large datasets
 _NUMBERS = re.compile(r"(u?int|float)\d+|bool")
 
 
-class LeRobotDataset(Dataset):
+class LeRobotDataset(ActionByStep):
     """A LeRobotDataset. Raises ConfigError without pyarrow, ObservationError for what isn't as its info.json says."""
 
     def __init__(self, path: Path, action: str | None = None) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from turbopi.support.reading import listing
 
 
 class RecordedCalls(Dataset):
-    """Calls that a server answered. Their observations have the robot's own keys."""
+    """Calls that a server answered, each with a chunk of its own. Their observations have the robot's own keys."""
 
     kind = "recording of turbopi serve"
     caveat = (
@@ -31,12 +30,6 @@ class RecordedCalls(Dataset):
     @cached_property
     def episodes(self) -> Sequence[Episode]:
         return tuple(Episode(n, len(files), run.name) for n, (run, files) in enumerate(self._runs.items()))
-
-    def read_actions(self, episode: Episode) -> np.ndarray:
-        raise NotImplementedError("every call has a chunk of its own")
-
-    def observations(self, episode: Episode, steps: Sequence[int]) -> Iterator[dict[str, Any]]:
-        return (moment.observation for moment in self.moments(episode, steps, 1))
 
     def moments(self, episode: Episode, steps: Sequence[int], horizon: int) -> Iterator[Moment]:
         files = list(self._runs.values())[episode.number]
