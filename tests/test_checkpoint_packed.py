@@ -151,3 +151,13 @@ def test_a_file_that_grows_without_end_is_refused(folder: Path, monkeypatch: pyt
     (folder / PACKED).write_bytes(lzma.compress(bytes(2**20 + 1), preset=0))
     with pytest.raises(CheckpointError, match="holds more than 1 MiB: unpack it beside itself"):
         open_checkpoint(folder)
+
+
+def test_unpacked_weights_beside_packed_ones_are_read_and_others_are_noted(folder: Path) -> None:
+    """As scripts/setup leaves them in a clone; after an update they may be of before."""
+    (folder / WEIGHTS).write_bytes(lzma.decompress((folder / PACKED).read_bytes()))
+    assert not [note for note in open_checkpoint(folder).source.notes if "two sources" in note]
+    with (folder / CHECKSUM).open("w") as stream:
+        stream.write("0" * 64 + f"  {WEIGHTS}\n")
+    notes = [note for note in open_checkpoint(folder).source.notes if "two sources of weights" in note]
+    assert len(notes) == 1 and f"{WEIGHTS} is read" in notes[0] and PACKED in notes[0]

@@ -17,7 +17,7 @@ from turbopi.checkpoint.missing_files import (
 )
 from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
-from turbopi.checkpoint.packed import PACKED, unpacked
+from turbopi.checkpoint.packed import PACKED, differs, unpacked
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
@@ -109,6 +109,7 @@ def _notes(folder: Path, read: CheckpointFormat, *, adapter: bool = False) -> tu
     others = {
         params: read != "openpi_jax" and params.is_dir(),
         whole: (read == "onnx" or adapter) and whole.is_file(),
+        folder / PACKED: whole.is_file() and differs(folder),
         index: index.is_file() and (read == "openpi_jax" or (whole.is_file() and not _is_of(index, whole))),
     }
     used = "the graphs" if read == "onnx" else "the adapter and its base" if adapter else whole.name

@@ -47,6 +47,11 @@ def unpacked(folder: Path) -> Path:
     return (cached if keep_in_cache(cached, content) else _write_temporary(content, expected, cached)).parent
 
 
+def differs(folder: Path) -> bool:
+    """Whether a folder has packed weights beside `model.safetensors`, and they are others."""
+    return (folder / PACKED).is_file() and not _is(folder / WEIGHTS, _checksum(folder / CHECKSUM))
+
+
 def _checksum(file: Path) -> str:
     """The SHA-256 in a file of `sha256sum`: 64 hexadecimal digits, then a name."""
     text = read_bytes(file, limit=4096, hint=f"; it belongs to {PACKED}").decode("ascii", "replace")
@@ -56,7 +61,7 @@ def _checksum(file: Path) -> str:
 
 
 def _is(file: Path, expected: str) -> bool:
-    """Whether a file of the cache can be read and has that SHA-256."""
+    """Whether a file can be read and has that SHA-256."""
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest() == expected
     except OSError:
