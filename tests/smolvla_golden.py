@@ -55,3 +55,11 @@ class GoldenRuns:
 
     def actions(self, run: int, part: str = "") -> np.ndarray:
         return self._expected[f"{run}/{part}actions"]
+
+
+def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Root mean square of the difference, of what `theirs` has; infinite for other shapes."""
+    if ours.shape != theirs.shape:
+        return np.inf
+    exact = theirs.astype(np.float64)
+    return float(np.sqrt(np.square(ours - exact).mean() / max(np.square(exact).mean(), 1e-12)))

@@ -1,6 +1,9 @@
 """The checked-in result of the GPU tests belongs to the code as it is."""
 
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -151,3 +154,25 @@ def test_a_backend_that_is_not_in_the_fingerprint_refuses_every_gpu() -> None:
 
 def test_whatever_those_files_import_is_in_the_fingerprint_or_runs_on_the_host_alone() -> None:
     assert gpu_evidence.uncovered_imports() == {}
+
+
+def script() -> ModuleType:
+    """scripts/gpu_check, whose name has no ending."""
+    loader = SourceFileLoader("gpu_check_script", str(gpu_evidence.ROOT / "scripts" / "gpu_check"))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    return module
+
+
+def test_a_second_run_repeats_what_failed_and_files_that_count_anew_and_counts_each_test_once() -> None:
+    gpu_check = script()
+    parts = [["tests/a.py::one", "tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"], ["tests/c.py::five"]]
+    left, repeated = gpu_check.left_of(parts, ["two[x]", "four", "gone"], ["tests/b.py"])
+    assert left == [["tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"]] and repeated == 1
+    before = gpu_evidence.GpuTests(6, 3, 0, 1, 10.0, ["two[x]", "four", "gone"], 0)
+    now = gpu_evidence.GpuTests(3, 1, 0, 0, 2.0, ["four"], 0)
+    assert gpu_check.added(before, now, repeated) == gpu_evidence.GpuTests(5, 1, 0, 1, 12.0, ["four"], 0)
+    nothing_left = gpu_check.added(before, None, 0)
+    assert (nothing_left.tests, nothing_left.failures, nothing_left.failed) == (3, 0, [])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_checkpoint, make_hub
+from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_checkpoint, make_hub, relative
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import open_checkpoint
@@ -38,12 +38,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def hub(folders: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("HF_HUB_CACHE", str(folders / "hub"))
     return folders / "hub"
-
-
-def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
-    assert ours.shape == theirs.shape
-    exact = theirs.astype(np.float64)
-    return float(np.sqrt(np.square(ours - exact).mean() / np.square(exact).mean()))
 
 
 @pytest.mark.parametrize("name", ["base", "missing_camera", "special_tokens", "long_prompt", "peft", "bf16"])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load
+from smolvla_golden import relative
 
 from turbopi.config import FloatPrecision
 from turbopi.models.observation import ModelInputs, Observation
@@ -116,13 +117,6 @@ class Case:
         ours, begin = self.computed(run, self.config, precision), f"{run}/{part}"
         theirs = {name.removeprefix(begin): value for name, value in self.expected.items() if name.startswith(begin)}
         return {name: relative(ours[name], value) for name, value in theirs.items() if name in ours}
-
-
-def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
-    if ours.shape != theirs.shape:
-        return np.inf
-    exact = theirs.astype(np.float64)
-    return float(np.sqrt(np.square(ours - exact).mean() / max(np.square(exact).mean(), 1e-12)))
 
 
 @cache

@@ -18,7 +18,7 @@ def with_stages(
     output: Output,
     first: str = "loading the weights",
 ) -> Result:
-    """work(told(begin, advance)): `begin(text, total)` opens a stage, `advance()` is one step of it.
+    """work(reported(begin, advance)): `begin(text, total)` opens a stage, `advance()` is one step of it.
 
     `first` goes on before the first stage, and is a line. Where nobody watches a bar, each stage is one, too.
     """

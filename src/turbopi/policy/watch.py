@@ -86,7 +86,7 @@ class Reading(NamedTuple):
     """Of one call.
 
     state    of the robot
-    widths   of the training range of its values: how far it has moved is told by them
+    widths   of the training range of its values: how far it has moved is seen by them
     outside  values of the state that are outside the training range
     actions  the farthest value of each action that is far outside
     clipped  whether the actions were clipped

@@ -39,7 +39,7 @@ class RobotInputs:
 
 
 class Example(dict[str, Any]):
-    """A made-up observation: its state and images say nothing of any robot, so nobody is told of them."""
+    """A made-up observation: its state and images say nothing of any robot, so there is no note on them."""
 
 
 @runtime_checkable

@@ -150,7 +150,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._feed()
 
     async def keepalive(self) -> None:
-        """The library's, which cuts whoever doesn't answer a ping in time, but for clients that are held back here:
+        """The library's, which cuts a client that doesn't answer a ping in time, but for those that are held back here:
         their pong may stand behind requests that wait for their turn, and aren't read yet.
         """
         assert self.ping_interval is not None
