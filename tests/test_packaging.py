@@ -61,7 +61,8 @@ def test_the_wheel_holds_every_file_of_the_package(wheel: Path) -> None:
         for path in PACKAGE.rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert packed == written
+    unpacked = {name.removesuffix(".xz") for name in written if name.endswith(".safetensors.xz")}  # scripts/setup's
+    assert packed == written - unpacked
 
 
 @pytest.mark.slow
