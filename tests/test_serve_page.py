@@ -70,8 +70,8 @@ async def robot(server: PolicyServer) -> AsyncIterator[ClientConnection]:
         yield connection
 
 
-async def ask(connection: ClientConnection, prompt: str = "", **more: Any) -> dict[str, Any] | str:
-    await connection.send(pack(observation(prompt) | more))
+async def ask(connection: ClientConnection, prompt: str = "", /, **more: Any) -> dict[str, Any] | str:
+    await connection.send(pack({**observation(prompt), **more}))
     reply = await asyncio.wait_for(connection.recv(), 60)
     return reply if isinstance(reply, str) else dict(unpack(reply))
 
@@ -294,11 +294,11 @@ def test_the_feed_tells_what_went_wrong() -> None:
             assert "Traceback" in str(await ask(connection, "crash"))
             got = await frame(watcher, lambda frame: len(frame.troubles) == 2)
             assert got.errors == {"actions": 1, "policy": 1}
-            assert [one.text for one in got.troubles] == [
-                "bad actions: the actions hold nan at [0, 3]",
-                "RuntimeError: CUDA error: invalid argument",
-            ]
-            assert got.lost is None and (await frame(watcher, lambda frame: not frame.robots)).clients == 0
+            refused = "bad actions: the actions hold nan at [0, 3]"
+            failed = "RuntimeError: CUDA error: invalid argument"
+            assert [one.text.partition(": ")[2] for one in got.troubles] == [refused, failed]
+            left = await frame(watcher, lambda frame: not frame.clients)
+            assert got.lost is None and [one.refusal.text for one in left.robots if one.refusal] == [failed]
         async with connect(live_url(server)) as watcher, robot(server) as connection:
             await ask(connection, "lost")
             assert "illegal memory access" in str((await frame(watcher, lambda frame: frame.lost)).lost)
@@ -322,7 +322,8 @@ def test_the_feed_has_the_notes_of_each_robots_last_answer_and_the_log_of_them()
             await ask(connection, "black")
             await ask(other, "bright")
             one, two = (await frame(watcher, lambda frame: [one.calls for one in frame.robots] == [1, 1])).robots
-            assert one.notes == ["camera front is black"] and two.notes == []
+            assert [(note.kind, note.names) for note in one.notes] == [("camera_black", ["front"])]
+            assert one.notes[0].text == "camera front is black" and two.notes == []
             got = await frame(watcher)
             assert [(trouble.error, trouble.text.partition(": ")[2]) for trouble in got.troubles] == [
                 ("camera_black", "camera front is black")
@@ -333,6 +334,83 @@ def test_the_feed_has_the_notes_of_each_robots_last_answer_and_the_log_of_them()
             ].notes == []
 
     served(test, Noting())
+
+
+def test_a_robot_has_its_name_and_its_place_and_is_gone_since() -> None:
+    named = {"turbopi/robot": "left <arm>"}
+
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher, robot(server) as other:
+            await ask(other)
+            async with robot(server) as connection:
+                await ask(connection, **named)
+                await ask(connection)  # once is enough
+                one, two = (await frame(watcher, lambda frame: [one.calls for one in frame.robots] == [1, 2])).robots
+                assert (one.name, two.name, two.lost) == ("", "left <arm>", None)
+                assert one.address.startswith("127.0.0.1:") and two.address != one.address
+            left = (await frame(watcher, lambda frame: frame.clients == 1)).robots[1]
+            assert (left.id, left.name, left.calls) == (two.id, two.name, 2)
+            assert left.lost is not None and left.lost >= two.connected and "it closed with 1000" in left.how
+            async with robot(server) as connection, robot(server) as silent:
+                await ask(connection, **named)
+                back = (await frame(watcher, lambda frame: frame.robots[1].calls == 3)).robots[1]
+                assert (back.id, back.lost) == (two.id, None)
+                assert "turbopi/robot is 3; it should be the robot's name" in str(
+                    await ask(silent, **{"turbopi/robot": 3})
+                )
+            kept = (await frame(watcher, lambda frame: frame.clients == 1)).robots
+            assert [one.lost is None for one in kept] == [True, False, False]
+            assert kept[2].refusal is not None and kept[2].refusal.kind == "observation"
+
+    served(test)
+
+
+def test_a_session_names_its_robot_and_robots_that_never_asked_leave_nothing() -> None:
+    policy = Robotic()
+    policy.metadata["real_time"] = {"modes": ["rtc"]}
+
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher:
+            async with robot(server), robot(server) as connection:
+                await ask(connection, **{"turbopi/session": "bench 3", "turbopi/mode": "none"})
+                got = await frame(watcher, lambda frame: frame.requests == 1 and frame.robots[1].calls == 1)
+                assert [one.name for one in got.robots] == ["", "bench 3"]
+            assert [one.name for one in (await frame(watcher, lambda frame: frame.clients == 0)).robots] == ["bench 3"]
+
+    served(test, policy)
+
+
+def test_few_gone_robots_are_shown_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher:
+            for number in range(live.MAX_LOST + 2):
+                async with robot(server) as connection:
+                    await ask(connection, **{"turbopi/robot": f"r{number}"})
+            got = await frame(watcher, lambda frame: frame.requests == live.MAX_LOST + 2 and not frame.clients)
+            assert [one.name for one in got.robots] == [f"r{number}" for number in range(2, live.MAX_LOST + 2)]
+            monkeypatch.setattr(live, "LOST_SECONDS", 0.0)
+            assert (await frame(watcher, lambda frame: not frame.robots)).clients == 0
+
+    served(test)
+
+
+def test_each_robot_has_its_latency_against_its_deadline_and_its_batch() -> None:
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher, robot(server) as connection, robot(server) as other:
+            await ask(connection, **{"turbopi/deadline_ms": 60_000})
+            late = await ask(connection, **{"turbopi/deadline_ms": 1e-3})
+            assert str(late).startswith("late")
+            three = {key: np.stack([value] * 3) for key, value in observation().items() if key != "prompt"}
+            assert isinstance(await ask(other, **three, **{"turbopi/batch": 3}), dict)
+            one, two = (got := await frame(watcher, lambda frame: frame.requests == 3)).robots
+            assert (one.deadline, one.timed, one.missed, one.rows, one.batch) == (60_000, 2, 1, None, 1)
+            assert one.refusal is not None and one.refusal.kind == "late" and len(one.times) == 1 and one.times[0] > 0
+            assert (two.deadline, two.timed, two.rows) == (None, 0, 3)
+            assert (got.timed, got.missed, sum(got.batches.values())) == (2, 1, 2)
+            await ask(connection)
+            assert (await frame(watcher, lambda frame: frame.requests == 4)).robots[0].refusal is None
+
+    served(test)
 
 
 def test_a_clients_text_is_cut_and_keeps_its_direction() -> None:
@@ -489,7 +567,7 @@ def test_a_preview_never_fails_for_what_a_robot_sends() -> None:
         **{f"n{i}": np.array([1.5]) for i in range(20)},
     }
     for actions in (None, np.zeros(3), np.zeros((2, 2), np.int64), np.zeros((1000, 100)), np.full((1, 2), np.nan)):
-        made = make_preview(1, 0.0, pack(strange), {"actions": actions}, {})
+        made = make_preview(1, 0.0, pack(strange), {"actions": actions}, [np.nan], {})
         assert list(made.images) == ["nested/deep"] and made.prompt == "" and len(made.numbers) == 4
         assert len(made.actions) == (1 if isinstance(actions, np.ndarray) and actions.shape == (1, 2) else 0)
         msgspec.json.encode(made)

@@ -12,6 +12,7 @@ from chromium import PROGRAM, Page, chromium
 from serve_fakes import FakePolicy, observation
 from websockets.sync.client import connect
 
+from turbopi.policy.watch import Outside, Reading, Sample
 from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer, running
 from turbopi.support.errors import ObservationError
@@ -21,6 +22,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(PROGRAM is None, reason="need
 HOSTILE = "</script><img src=x onerror=\"document.title='owned'\"><b>bowl</b>"
 ACTIONS = np.stack([np.linspace(-1, 1, 5), *(np.full(5, value) for value in (0, 0.5, 0, 0, 0, -1))], axis=1)
 
+
+# of all text that is seen
+SIZES = """[...document.querySelectorAll("main *")].filter((one) => one.checkVisibility() &&
+    [...one.childNodes].some((child) => child.nodeType == 3 && child.data.trim()))
+    .map((one) => getComputedStyle(one).fontSize)"""
 
 # of the image's middle
 COLOUR = """(async () => {
@@ -43,12 +49,29 @@ class Arm(FakePolicy):
             "backend": "fused",
             "backend_reason": f"auto: the fastest {HOSTILE}",
             "device": "cpu",
+            "features": {
+                "state": [{"name": name, "unit": "m", "low": 0.0, "high": 1.0} for name in "xyz"],
+                "actions": [
+                    {"name": name, "unit": "1 = 0.05 m a step", "low": low, "high": None if low is None else 0.5}
+                    for name, low in (("x", -0.5), ("y", 0.0), ("z", None))
+                ],
+            },
         }
 
-    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+    gives_readings = True
+
+    def infer(self, obs: dict[str, Any], readings: bool = False) -> dict[str, Any]:
+        assert readings
         if obs["prompt"] == "wrong":
             raise ObservationError(f"it holds {HOSTILE}")
-        return {"actions": ACTIONS, "policy_timing": {"vision_ms": 1.25, "denoise_ms": 2.5, "infer_ms": 4.0}}
+        far = Outside("z", 2.0, 0.0, 1.0, far=True)
+        black = {"front": Sample((2, 2), bytes(12))}
+        timing = {"vision_ms": 1.25, "denoise_ms": 2.5, "infer_ms": 4.0}
+        return {
+            "actions": ACTIONS,
+            "policy_timing": timing,
+            "reading": Reading([0.0, 0.5, 2.0], (), (far,), images=black),
+        }
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +82,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 
 @contextmanager
-def robot(server: PolicyServer, prompt: str, *, key: str = "") -> Iterator[None]:
+def robot(server: PolicyServer, prompt: str, *, key: str = "", name: str = "") -> Iterator[None]:
     """A robot that asks on and on."""
+    named = {"turbopi/robot": name} if name else {}
     done, failed = threading.Event(), list[BaseException]()
     camera_image = np.zeros((32, 64, 3), np.uint8)
     camera_image[..., 0] = 200
@@ -71,7 +95,7 @@ def robot(server: PolicyServer, prompt: str, *, key: str = "") -> Iterator[None]
             with connect(server.url, compression=None, additional_headers=headers) as connection:
                 connection.recv()
                 for number in itertools.count():
-                    connection.send(pack(observation(prompt) | {"front": camera_image}))
+                    connection.send(pack(observation(prompt) | named | {"front": camera_image}))
                     assert isinstance(connection.recv(), bytes)
                     if number == 3:
                         connection.send(pack(observation("wrong")))
@@ -105,7 +129,7 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
     with running(Arm()) as server, robot(server, HOSTILE):
         page.open(address(server))
         page.until("document.querySelectorAll('.robot img').length == 2")
-        page.until("document.querySelector('#troubles b')")
+        page.until("document.querySelector('#troubles').textContent.includes('it holds')")
         page.until("document.querySelector('.robot img').naturalWidth > 0")
         # hostile text is text
         assert text(page, ".prompt") == f"“{HOSTILE}”"
@@ -117,10 +141,10 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
         assert abs(red - 200) < 8 and green < 8
         assert "front\n64 × 32" in text(page, ".images")
         # the chunk: a line a dimension, from the bottom left to the top right for the first
-        titles = page.value("[...document.querySelectorAll('.plot h4')].map((title) => title.firstChild.textContent)")
-        assert titles == ["translation", "rotation", "gripper"]
+        titles = page.value("[...document.querySelectorAll('.plots h4 div')].map((title) => title.firstChild.data)")
+        assert [title.strip() for title in titles] == ["translation", "rotation", "gripper"]
         lines = page.value(
-            "[...document.querySelectorAll('.plot polyline')].map((line) => line.getAttribute('points'))"
+            "[...document.querySelectorAll('.plots polyline')].map((line) => line.getAttribute('points'))"
         )
         rising, *_ = drawn = [[tuple(map(float, point.split(","))) for point in line.split()] for line in lines]
         assert [len(points) for points in drawn] == [5] * 7
@@ -128,6 +152,17 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
         assert rising == sorted(rising) and heights == sorted(heights, reverse=True)
         (level,) = {y for _, y in drawn[2]}  # 0.5
         assert heights[4] < level < heights[2]
+        # state and training range: z is at 2, in training 0 to 1
+        assert page.value("[...document.querySelectorAll('.state .row')].map((row) => row.textContent)") == [
+            "x0 m",
+            "y0.5 m",
+            "z2 m",
+        ]
+        places = page.value("[...document.querySelectorAll('.track i')].map((mark) => mark.style.left)")
+        assert places == ["25%", "50%", "100%"]
+        assert page.value("document.querySelectorAll('.axes .range').length") == 2  # the third isn't known
+        assert page.value("document.querySelectorAll('.state .wrong').length") == 1 and "z is 2" in text(page, ".notes")
+        assert page.value("document.querySelectorAll('figure.wrong').length") == 1
         # numbers
         rows = page.value("[...document.querySelectorAll('#latency tr')].map((row) => row.innerText.split('\\t'))")
         medians = {row[0]: row[1] for row in rows}
@@ -138,11 +173,14 @@ def test_the_page_shows_robots_chunks_latency_errors_and_the_backend(page: Page)
         assert int(text(page, "#requests").replace(",", "")) >= 4
         calls = page.value("Number(document.querySelector('.robot').dataset.call)")
         page.until(f"Number(document.querySelector('.robot').dataset.call) > {calls}")  # it is live
-        for width in (390, 1000):
+        for width in (390, 1000, 2560):
             page.resize(width, 900)
             assert page.value("document.documentElement.scrollWidth") <= width
+            assert set(page.value(SIZES)) <= {"11px", "12px", "14px", "16px", "20px"}
+        page.resize(1000, 900)
         assert page.screenshot()[1:4] == b"PNG"
     page.until("document.querySelector('#status').className == 'status down'")
+    assert "since" in text(page, "#status")
     own = {address(server), server.url + "/live", address(server) + "healthz"}
     assert {url for url in page.requested if not url.startswith("data:")} <= own
     page.open("about:blank")
@@ -154,12 +192,21 @@ def test_robots_come_and_go(page: Page) -> None:
         page.open(address(server))
         page.until("document.querySelector('#no-robots').hidden === false && !document.querySelector('#all').hidden")
         with robot(server, "first"):
-            with robot(server, "second"):
+            with robot(server, "second", name="left arm"):
                 page.until("document.querySelectorAll('.robot img').length == 4")
                 assert page.value("document.querySelectorAll('.robot').length") == 2
-            page.until("document.querySelectorAll('.robot').length == 1")
-            assert text(page, ".prompt") == "“first”"
-        page.until("document.querySelectorAll('.robot').length == 0")
+            page.until("document.querySelectorAll('.robot.gone').length == 1")
+            assert text(page, ".robot.gone h3") == "left arm" and "gone since" in text(page, ".robot.gone")
+            assert text(page, ".robot:not(.gone) .prompt") == "“first”"
+            with robot(server, "second", name="left arm"):
+                page.until("!document.querySelector('.robot.gone')")
+                assert (
+                    page.value(
+                        "[...document.querySelectorAll('h3')].filter((one) => one.textContent == 'left arm').length"
+                    )
+                    == 1
+                )
+        page.until("document.querySelectorAll('.robot.gone').length == 2")
         page.open("about:blank")
 
 

@@ -28,7 +28,7 @@ from turbopi.serve import PolicyServer, running
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.view.calls import ViewedCall, ViewedTrouble
 from turbopi.view.live import LiveServer
-from turbopi.view.recorded import recorded, robot_of
+from turbopi.view.recorded import policy_of, recorded
 from turbopi.view.viewer import COMMAND, Viewer, open_viewer
 
 with_rerun = pytest.mark.skipif(find_spec("rerun") is None, reason="needs rerun: pip install -e '.[view]'")
@@ -73,7 +73,7 @@ def recording(tmp_path: Path) -> tuple[Path, dict[int, RecordedCall]]:
 def test_a_recordings_calls_are_viewed_as_they_were(recording: tuple[Path, dict[int, RecordedCall]]) -> None:
     folder, calls = recording
     for path in (folder, folder.parent):
-        assert robot_of(path) == "libero"
+        assert policy_of(path)["robot"] == "libero"
         viewed = [one for one in recorded(path) if isinstance(one, ViewedCall)]
         assert [one.number for one in viewed] == [1, 2, 3, 5, 6]
         for one, (number, truth) in zip(viewed, calls.items(), strict=True):

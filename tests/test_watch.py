@@ -478,3 +478,16 @@ def test_statistics_that_are_made_up_doubt_no_state_but_may_bound_actions(policy
     warning = Checks(policy.pipeline, stats, judges_ranges=False)
     assert warning.state.outside([1e9] * 8) == () and not len(warning.actions.low)
     assert len(Checks(policy.pipeline, stats, "clip", judges_ranges=False).actions.low) == 7
+
+
+def test_metadata_has_names_units_and_training_ranges_where_they_are_known(policy: UnifiedPolicy) -> None:
+    stats = open_checkpoint(SMALL_POLICY).norm_stats
+    features = json.loads(json.dumps(policy.metadata["features"]))
+    assert {key: len(found) for key, found in features.items()} == {"state": 8, "actions": 7}
+    z, about_x = features["state"][2], features["actions"][3]
+    assert (z["name"], z["unit"], about_x["name"]) == ("z", "m", "about x")
+    assert stats.state is not None and stats.state.q01 is not None and stats.state.q99 is not None
+    assert (z["low"], z["high"]) == (stats.state.q01[2], stats.state.q99[2]) and about_x["low"] < about_x["high"]
+    made_up = Checks(policy.pipeline, stats, judges_ranges=False).features
+    assert [one["name"] for one in made_up["state"]] == [one["name"] for one in features["state"]]
+    assert {one[end] for found in made_up.values() for one in found for end in ("low", "high")} == {None}

@@ -1,7 +1,7 @@
 """`turbopi view`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -78,17 +78,16 @@ def view(
 
         server = LiveServer(what, chosen_key(api_key, api_key_file))
         try:
-            robot = str(server.hello.policy.get("robot", ""))
-            _draw(_watched(server, seconds, output), what, robot, save, rate, output)
+            _draw(_watched(server, seconds, output), what, server.hello.policy, save, rate, output)
         finally:
             server.close()
     else:
         if seconds is not None:
             raise ConfigError("--seconds is for a server's address: a recording is shown whole")
-        from turbopi.view.recorded import recorded, robot_of
+        from turbopi.view.recorded import policy_of, recorded
 
         recording = Path(what)
-        _draw(recorded(recording), recording.name, robot_of(recording), save, rate, output)
+        _draw(recorded(recording), recording.name, policy_of(recording), save, rate, output)
 
 
 def _watched(server: "LiveServer", seconds: float | None, output: Output) -> "Iterator[ViewedCall | ViewedTrouble]":
@@ -103,7 +102,7 @@ def _watched(server: "LiveServer", seconds: float | None, output: Output) -> "It
 def _draw(
     seen: "Iterator[ViewedCall | ViewedTrouble]",
     name: str,
-    robot: str,
+    policy: dict[str, Any],
     save: Path | None,
     rate: float | None,
     output: Output,
@@ -112,7 +111,7 @@ def _draw(
     from turbopi.view.drawing import Drawing
 
     calls = troubles = 0
-    drawing = Drawing(save, name, robot, rate)
+    drawing = Drawing(save, name, policy, rate)
     try:
         for one in seen:
             if isinstance(one, ViewedCall):

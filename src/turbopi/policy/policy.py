@@ -459,6 +459,7 @@ class UnifiedPolicy:
             "real_time": {"modes": list(self._conditioning.modes), **dataclasses.asdict(self.config.real_time)},
             **self._loading,
             **self._pipeline.metadata,
+            "features": self._checks.features,
         }
 
     def _horizon(self, horizon: int | None) -> int:

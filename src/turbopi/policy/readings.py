@@ -6,7 +6,7 @@ one robot. What a call without findings costs: docs/dev/serving.md.
 
 import functools
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from turbopi.policy.ranges import DrawnRange, TrainingRange, refusal
 from turbopi.policy.watch import MOST_CAMERAS, Reading, Sample
 from turbopi.preprocess.pipeline import Incoming, Pipeline, of_row
 from turbopi.robots.base import Example
-from turbopi.robots.labels import action_labels, camera_label, state_labels
+from turbopi.robots.labels import Label, action_labels, camera_label, state_labels
 from turbopi.support.errors import ActionError, ConfigError
 
 OutOfRange = Literal["warn", "refuse", "clip"]
@@ -42,8 +42,12 @@ class Checks:
         robot, action_width = pipeline.robot, pipeline.metadata["robot_action_dim"]
         state_width = pipeline.state_scale.width if robot.state_dim is None else robot.state_dim
         judged = stats if judges_ranges or out_of_range != "warn" else NormStats()
-        self.state = TrainingRange(judged.state if judges_ranges else None, state_labels(robot, state_width or 0))
-        self.actions = TrainingRange(judged.actions, action_labels(robot, action_width))
+        self._state_labels, self._action_labels = (
+            state_labels(robot, state_width or 0),
+            action_labels(robot, action_width),
+        )
+        self.state = TrainingRange(judged.state if judges_ranges else None, self._state_labels)
+        self.actions = TrainingRange(judged.actions, self._action_labels)
         self._least, self._most = self._normalized(self.actions.least), self._normalized(self.actions.most)
         self._surely = min([np.inf, *-self._least, *self._most])  # what no action is far beyond, normalised
         self._labels: dict[tuple[str, ...], list[str]] = {}  # of cameras
@@ -53,6 +57,12 @@ class Checks:
         """For plots: the ranges of state and actions, empty ones where the statistics are made up."""
         actions = self.actions.drawn_of_actions(self._robot, self._pipeline.config.model.action_dim)
         return self.state.drawn, actions
+
+    @functools.cached_property
+    def features(self) -> dict[str, list[dict[str, Any]]]:
+        """ "state" and "actions", each number's name, unit and training range, in plain values; None where unknown."""
+        state, actions = self.drawn
+        return {"state": _plain(self._state_labels, state), "actions": _plain(self._action_labels, actions)}
 
     def _normalized(self, ends: np.ndarray) -> np.ndarray:
         """float64[d], of actions, as the model has them: float32[d]."""
@@ -104,6 +114,13 @@ class Checks:
                 allowed = chunks.copy() if allowed is chunks else allowed
                 np.clip(used[row], self._least, self._most, out=allowed[row, :, : len(self._least)])
         return allowed, judged
+
+
+def _plain(labels: Sequence[Label], known: DrawnRange) -> list[dict[str, Any]]:
+    ends = np.full((2, len(labels)), np.nan)
+    ends[:, : len(known.low)] = known.low, known.high
+    ranges = [(low, high) if np.isfinite((low, high)).all() else (None, None) for low, high in ends.T.tolist()]
+    return [{**label._asdict(), "low": low, "high": high} for label, (low, high) in zip(labels, ranges, strict=True)]
 
 
 def sample(image: np.ndarray) -> Sample:

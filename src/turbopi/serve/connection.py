@@ -100,6 +100,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         limits = shared.limits
         super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
         self.bad_in_a_row = 0
+        self.robot = ""  # the name that its client gave; its session's, if it gave none
         self.unpacker = Unpacker()  # of its messages
         self.watch, self.batch_watch = Watch(), Watch(remembers=False)  # of its robot; of the rows of batch messages
         self._owner, self._shared, self._limits = owner, shared, limits

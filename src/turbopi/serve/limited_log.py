@@ -61,6 +61,7 @@ class LimitedLog:
 
 
 def peer(connection: ServerConnection) -> str:
-    """Address and port of the client, as the log writes them."""
-    address = connection.remote_address
-    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)
+    """The client's name, if it gave one, address and port, as the log writes them."""
+    address, name = connection.remote_address, getattr(connection, "robot", "")
+    place = f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)
+    return f"{name} ({place})" if name else place

@@ -20,7 +20,17 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 
 from turbopi.policy.watch import READING, Reading, Watch
-from turbopi.realtime.messages import MAX_STEP, MOST_NOTES, NOTES, PREFIX, SCHEDULING_KEYS, Note, as_number, notes_in
+from turbopi.realtime.messages import (
+    MAX_SESSION,
+    MAX_STEP,
+    MOST_NOTES,
+    NOTES,
+    PREFIX,
+    SCHEDULING_KEYS,
+    Note,
+    as_number,
+    notes_in,
+)
 from turbopi.realtime.wire import Unpacker, WireError
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.metrics import Metrics
@@ -127,11 +137,15 @@ class Refusal(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The map to send, with "server_timing", what the request said about scheduling, and the notes for the log."""
+    """The map to send, with "server_timing", what the request said about scheduling, and the notes for the log.
+
+    state  of the robot, as the policy read it; empty if it doesn't tell, and for a batch
+    """
 
     result: dict[str, Any]
     scheduling: "SchedulingOptions"
     notes: Sequence[Note] = ()
+    state: Sequence[float] = ()
 
 
 class ClientLeft(Exception):
@@ -209,8 +223,9 @@ class RequestHandler:
         failed = first_error(request, results)
         self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
         if failed is None:
+            state = _state_of(request, results)
             noted = self._note(request, results)
-            return Reply(self._answer(request, results), request.scheduling, noted)
+            return Reply(self._answer(request, results), request.scheduling, noted, state)
         if failed.error == "policy":
             raise PolicyFailed(failed.text)
         assert failed.error is not None
@@ -234,8 +249,11 @@ class RequestHandler:
     def read(self, received: Mapping[str, Any], connection: GuardedConnection, arrived: float) -> ClientRequest:
         """Raises ObservationError for keys and values that can't be right."""
         scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
+        connection.robot = read_robot(received) or connection.robot
         if scheduling.batch is None:
-            return ClientRequest(self._real_time.plan(received, connection), scheduling, connection, arrived)
+            plan = self._real_time.plan(received, connection)
+            connection.robot = connection.robot or plan.name or ""
+            return ClientRequest(plan, scheduling, connection, arrived)
         check_batch_keys(received, execution=self._options.execution is not None)
         largest = self._calls.largest
         if self._strict and scheduling.batch > largest:
@@ -312,6 +330,8 @@ class RequestHandler:
         answers = [result.answer for result in results if result.answer is not None]
         runs = list({result.run: result for result in results}.values())
         server_timing = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
+        if (largest := max(run.batch for run in runs)) > 1:
+            server_timing["batch"] = largest
         timing = sum_timings([run.answer.get(TIMING, {}) for run in runs if run.answer is not None])
         stacked = {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
         noted = [{**note.plain, "row": row} for row, answer in enumerate(answers) for note in notes_in(answer)]
@@ -328,6 +348,11 @@ def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str
     if not all(isinstance(key, str) for key in observation):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
+
+
+def _state_of(request: ClientRequest, results: Sequence[Result]) -> Sequence[float]:
+    reading = (results[0].answer or {}).get(READING) if request.scheduling.batch is None else None
+    return reading.state if isinstance(reading, Reading) else ()
 
 
 def first_error(request: ClientRequest, results: Sequence[Result]) -> Result | None:
@@ -364,6 +389,16 @@ class SchedulingOptions:
     firm: bool = False
     priority: Priority = "robot"
     batch: int | None = None
+
+
+def read_robot(received: Mapping[str, Any]) -> str:
+    """The name that a robot gives itself, "" for none. Raises ObservationError."""
+    name = received.get(f"{PREFIX}robot", "")
+    if f"{PREFIX}robot" in received and not (isinstance(name, str) and 0 < len(name) <= MAX_SESSION):
+        raise ObservationError(
+            f"{PREFIX}robot is {name!r:.100}; it should be the robot's name, text of 1 to {MAX_SESSION} characters"
+        )
+    return str(name)
 
 
 def read_scheduling(

@@ -268,6 +268,7 @@ class PolicyServer:
                 self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
             self._live.connected(connection)
+        how = ""
         self.metrics.clients.inc()
         self._log.info(f"{peer(connection)} connected", "connections")
         try:
@@ -275,11 +276,13 @@ class PolicyServer:
             await self._converse(connection)
         except ClientLeft:
             self.metrics.error("disconnected")
+            how = "it left during its request"
             self._log.info(f"{peer(connection)} left during its request", "connections")
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.metrics.error("too_large")
-            self._log.info(f"{peer(connection)} disconnected{_said(closed)}", "connections")
+            how = _said(closed)
+            self._log.info(f"{peer(connection)} disconnected{how and f': {how}'}", "connections")
         except PolicyFailed as failure:
             await self._fail(connection, str(failure))
         except Exception:  # a fault of this server must cost one client, not all
@@ -290,13 +293,13 @@ class PolicyServer:
             self._real_time.closed(connection)
             self.metrics.clients.dec()
             if self._live is not None:
-                self._live.disconnected(connection)
+                self._live.disconnected(connection, how)
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
         self.metrics.error("policy")
         if self._live is not None:
-            self._live.failed("policy", text.strip().rpartition("\n")[2])  # what was raised
+            self._live.refused(connection, "policy", text.strip().rpartition("\n")[2])  # what was raised
         with contextlib.suppress(ConnectionClosed):
             await connection.send(text)
             await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
@@ -318,7 +321,7 @@ class PolicyServer:
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
                 continue
-            result, scheduling, notes = reply
+            result, scheduling, notes = reply[:3]
             if previous_total is not None:
                 result["server_timing"]["prev_total_ms"] = previous_total * 1e3
             await connection.send(pack(result))
@@ -330,11 +333,11 @@ class PolicyServer:
             for note in notes:
                 self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
                 if self._live is not None:
-                    self._live.failed(note.kind, f"{peer(connection)}: {note.text}")
+                    self._live.noted(connection, note.kind, note.text)
             previous_total = finished - started  # with the wait for the request, as openpi counts it
             if self._live is not None:
                 assert isinstance(message, bytes)
-                self._live.answered(connection, message, result, finished - received)
+                self._live.answered(connection, message, reply, finished - received)
             if self._recorder is not None:
                 assert isinstance(message, bytes)
                 self._record(message, result, scheduling.batch)
@@ -349,7 +352,7 @@ class PolicyServer:
         self.metrics.error(kind)
         self._log.warning(f"{peer(connection)}: {text}", kind)
         if self._live is not None:
-            self._live.failed(kind, text)
+            self._live.refused(connection, kind, text)
         await connection.send(text)
         connection.answered("bad" if kind in ("malformed", "observation") else "neither")
         if connection.bad_in_a_row >= self._limits.bad_messages:
@@ -380,8 +383,8 @@ def _set_aside_what_stays() -> None:
 
 
 def _said(closed: ConnectionClosed) -> str:
-    """What the end of a connection said of itself. A client that only ends, as openpi's does, says nothing."""
+    """What the end of a connection said of itself, "" for nothing, as of a client that only ends: openpi's does."""
     frame = closed.rcvd if closed.rcvd_then_sent or closed.sent is None else closed.sent
     if frame is None:
         return ""
-    return f": {'it' if frame is closed.rcvd else 'the server'} closed with {frame}"
+    return f"{'it' if frame is closed.rcvd else 'the server'} closed with {frame}"

@@ -68,6 +68,15 @@ def action_groups(robot: str, dims: int, names: Sequence[str] | None = None) -> 
     ]
 
 
+def names_of(metadata: Mapping[str, Any], feature: str) -> list[str] | None:
+    """The names of a policy's "state" or "actions" as its metadata's "features" tell them; None if they don't."""
+    features = metadata.get("features")
+    known = features.get(feature) if isinstance(features, Mapping) else None
+    if not isinstance(known, list) or not all(isinstance(one, Mapping) for one in known):
+        return None  # the policy may be of another make
+    return [str(one.get("name", "")) for one in known]
+
+
 def images_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.ndarray]:
     """The images in an observation of any robot, by key, as [h, w, 3] to look at."""
     found: dict[str, np.ndarray] = {}

@@ -9,17 +9,18 @@
     latency/STAGE      milliseconds
     errors             what went wrong
 
-With several robots, as live, each robot's are below its address.
+With several robots, as live, each robot's are below its name, or its address.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from turbopi.support.action_groups import ActionGroup, action_groups
+from turbopi.support.action_groups import ActionGroup, action_groups, names_of
 from turbopi.view.calls import ViewedCall, ViewedTrouble
 from turbopi.view.viewer import open_viewer
 
@@ -32,12 +33,12 @@ class Drawing:
 
     file    where it goes, an .rrd; None opens the viewer
     name    what it is called
-    robot   whose action dimensions they are ("libero", …), for their names and units
+    policy  its metadata: names and units of state and actions
     rate    control steps a second: how long an action takes. None: executed actions aren't drawn
     """
 
-    def __init__(self, file: Path | None, name: str, robot: str, rate: float | None = None) -> None:
-        self._robot, self._rate = robot, rate
+    def __init__(self, file: Path | None, name: str, policy: Mapping[str, Any], rate: float | None = None) -> None:
+        self._policy, self._rate = policy, rate
         self._stream = rr.RecordingStream("turbopi")
         if file is None:
             self._viewer = open_viewer()
@@ -81,8 +82,11 @@ class Drawing:
         if call.actions is not None:
             chunk = rr.Tensor(call.actions, dim_names=("step", "dimension"))
             self._stream.log(_path(call, "chunk", "values"), chunk)
-            for group in action_groups(self._robot, call.actions.shape[1]):
+            for group in self._groups(call.actions):
                 self._stream.log(_path(call, "chunk", group.title), _drawn(group, call.actions))
+
+    def _groups(self, actions: np.ndarray) -> list[ActionGroup]:
+        return action_groups(str(self._policy.get("robot", "")), actions.shape[1], names_of(self._policy, "actions"))
 
     def _draw_executed(self, call: ViewedCall, until: float | None) -> None:
         """The actions of a call that were carried out before the answer of the next one came; all, if there is none."""
@@ -90,7 +94,7 @@ class Drawing:
             return
         times = call.time + np.arange(len(call.actions)) / self._rate
         count = len(times) if until is None else int(np.searchsorted(times, until))
-        for group in action_groups(self._robot, call.actions.shape[1]):
+        for group in self._groups(call.actions):
             self._stream.send_columns(
                 "/".join(_escaped(_path(call, "executed", group.title))),
                 indexes=[rr.TimeColumn("time", timestamp=times[:count])],
@@ -103,9 +107,12 @@ class Drawing:
         def origin(*parts: str) -> str:
             return "/".join(_escaped(_path(call, *parts)))
 
-        groups = [] if call.actions is None else action_groups(self._robot, call.actions.shape[1])
+        groups = [] if call.actions is None else self._groups(call.actions)
+        state = names_of(self._policy, "state") or []
         for key, values in call.numbers.items():
-            self._stream.log(_path(call, "state", key), rr.SeriesLines(colors=_colors(len(values))), static=True)
+            names = state if len(state) == len(values) else None
+            lines = rr.SeriesLines(names=names, colors=_colors(len(values)))
+            self._stream.log(_path(call, "state", key), lines, static=True)
         if self._rate is not None:
             for group in groups:
                 lines = rr.SeriesLines(names=list(group.names.values()), colors=_colors(len(group.names)))

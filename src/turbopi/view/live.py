@@ -89,7 +89,7 @@ class LiveServer:
 
 def _call(robot: RobotFrame, preview: Preview) -> ViewedCall:
     return ViewedCall(
-        robot=robot.address,
+        robot=robot.name or robot.address,
         number=preview.number,
         time=preview.time,
         prompt=preview.prompt,

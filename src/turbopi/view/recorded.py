@@ -15,14 +15,13 @@ from turbopi.support.reading import is_finite, read_json
 from turbopi.view.calls import EncodedImage, ViewedCall, ViewedTrouble
 
 
-def robot_of(recording: Path) -> str:
-    """The robot that the recording's manifest names, "" if there is none."""
+def policy_of(recording: Path) -> dict[str, Any]:
+    """The policy's metadata in the recording's manifest, empty if there is none."""
     folder = recorded_files(recording)[0].parent
     if not (folder / "manifest.json").is_file():
-        return ""
+        return {}
     metadata = read_json(folder / "manifest.json", ObservationError).get("metadata")
-    robot = metadata.get("robot") if isinstance(metadata, dict) else None
-    return robot if isinstance(robot, str) else ""
+    return metadata if isinstance(metadata, dict) else {}
 
 
 def recorded(recording: Path) -> Iterator[ViewedCall | ViewedTrouble]:

@@ -8,10 +8,11 @@ import contextlib
 import json
 import logging
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import msgspec
@@ -31,12 +32,14 @@ from turbopi.serve.page.messages import (
     Memory,
     Preview,
     RobotFrame,
+    RobotNote,
     StageTimes,
     Trouble,
     clean,
 )
 from turbopi.serve.page.preview import make_preview
-from turbopi.support.action_groups import action_groups
+from turbopi.serve.requests import Reply
+from turbopi.support.action_groups import ActionGroup, action_groups, known_groups, names_of
 from turbopi.version import turbopi_version
 
 logger = logging.getLogger(__name__)
@@ -46,6 +49,8 @@ PREVIEWS_A_SECOND = 16.0  # of all robots together
 MESSAGE_BYTES = 16 * 2**20  # of an observation: a longer one isn't stored for its preview
 MAX_PENDING = 4  # previews that are being made or wait: other calls aren't shown
 ROBOTS = 16  # shown, of those that are connected
+MAX_LOST, LOST_SECONDS = 8, 900.0  # robots that are shown when they are gone, and for how long
+TIMES = 60  # of a robot's answers
 CALLS = 512  # whose times are stored
 TROUBLES = 20
 BINS = 60
@@ -56,17 +61,31 @@ Timing = Mapping[str, float]
 
 @dataclass
 class _Robot:
-    """A connected client."""
+    """A client that is connected, or was. What isn't said here: `RobotFrame`."""
 
     id: int
     address: str
     connected: float
+    name: str = ""
+    lost: float | None = None
+    how: str = ""
     calls: int = 0
     last: float | None = None
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=TIMES))
+    deadline: float | None = None
+    timed: int = 0
+    missed: int = 0
+    batch: int = 1
+    rows: int | None = None
     preview: Preview | None = None
     previewed: float = -np.inf  # the event loop's time
     pending: bool = False
-    notes: list[str] = field(default_factory=list)
+    notes: list[RobotNote] = field(default_factory=list)
+    refusal: RobotNote | None = None
+
+    @property
+    def title(self) -> str:
+        return clean(self.name) or self.address
 
 
 @dataclass(frozen=True)
@@ -82,6 +101,9 @@ class _Moment:
     errors: dict[str, int]
     troubles: Sequence[Trouble]
     timings: Sequence[Timing]
+    batches: Sequence[int]
+    timed: int
+    missed: int
     robots: Sequence[RobotFrame]
 
 
@@ -101,8 +123,10 @@ class Live:
     def __init__(self, metrics: Metrics, queue: Queue, why_lost: Callable[[], str | None]) -> None:
         self._metrics, self._queue, self._why_lost = metrics, queue, why_lost
         self._robots: dict[GuardedConnection, _Robot] = {}
-        self._known = 0
+        self._lost: deque[_Robot] = deque(maxlen=MAX_LOST)
+        self._known = self._timed = self._missed = 0
         self._timings: deque[Timing] = deque(maxlen=CALLS)
+        self._batches: deque[int] = deque(maxlen=CALLS)
         self._troubles: deque[Trouble] = deque(maxlen=TROUBLES)
         self._watchers = 0
         self._pending: set[asyncio.Task[None]] = set()
@@ -122,7 +146,7 @@ class Live:
             started=time.time(),
             queue_limit=queue_limit,
             policy=json.loads(json.dumps(metadata, default=_plain, skipkeys=True)),
-            actions=list(action_groups(robot, dims)) if isinstance(robot, str) and isinstance(dims, int) else [],
+            actions=_groups(robot, dims, names_of(metadata, "actions")) if isinstance(dims, int) else [],
         )
         self._hello = _json(hello)
 
@@ -141,19 +165,33 @@ class Live:
         self._known += 1
         self._robots[connection] = _Robot(self._known, peer(connection), time.time())
 
-    def disconnected(self, connection: GuardedConnection) -> None:
-        self._robots.pop(connection, None)
+    def disconnected(self, connection: GuardedConnection, how: str) -> None:
+        """`how`: what the end of the connection said of itself, "" for nothing."""
+        robot = self._robots.pop(connection, None)
+        if robot is not None and (robot.calls or robot.refusal) and not self._is_back(robot.name):
+            robot.lost, robot.how, robot.preview = time.time(), clean(how), None
+            self._lost.append(robot)
 
-    def answered(
-        self, connection: GuardedConnection, message: bytes, reply: Mapping[str, object], seconds: float
-    ) -> None:
+    def answered(self, connection: GuardedConnection, message: bytes, reply: Reply, seconds: float) -> None:
         """`reply` was sent, `seconds` after `message` had come. They must not change any more."""
-        robot = self._robots[connection]
+        robot, result, scheduling = self._known_by_name(connection), reply.result, reply.scheduling
         robot.calls += 1
         robot.last = time.time()
-        robot.notes = [clean(note.text) for note in notes_in(reply)]
-        timing = _timing(reply, seconds)
+        robot.refusal, robot.notes = (
+            None,
+            [
+                RobotNote(note.kind, [clean(name, 60) for name in note.names], clean(note.text))
+                for note in notes_in(result)
+            ],
+        )
+        robot.deadline = scheduling.deadline * 1e3 if scheduling.firm else None
+        robot.batch, robot.rows = int(result["server_timing"].get("batch", 1)), scheduling.batch
+        if scheduling.firm:
+            self._count_deadline(robot, missed=seconds > scheduling.deadline)
+        timing = _timing(result, seconds)
+        robot.times.append(timing["request"])
         self._timings.append(timing)
+        self._batches.append(robot.batch)
         if not self._watchers or robot.pending or len(self._pending) >= MAX_PENDING or self._closed.is_set():
             return
         now = asyncio.get_running_loop().time()
@@ -164,17 +202,43 @@ class Live:
             self._pending.add(task)
             task.add_done_callback(self._pending.discard)
 
-    def failed(self, kind: str, text: str) -> None:
-        """A request got no actions, and `text` is what the client was sent; or the log has a note."""
-        self._troubles.append(Trouble(time.time(), kind, clean(text)))
+    def noted(self, connection: GuardedConnection, kind: str, text: str) -> None:
+        """The log has a note on a robot's call."""
+        self._troubles.append(Trouble(time.time(), kind, f"{self._known_by_name(connection).title}: {clean(text)}"))
 
-    async def _make_preview(
-        self, robot: _Robot, message: bytes | None, reply: Mapping[str, object], timing: Timing
-    ) -> None:
+    def refused(self, connection: GuardedConnection, kind: str, text: str) -> None:
+        """A request got no actions; `text` is what the client was sent, or its last line."""
+        robot = self._known_by_name(connection)
+        robot.refusal = RobotNote(kind, [], clean(text))
+        if kind == "late":
+            self._count_deadline(robot, missed=True)
+        self._troubles.append(Trouble(time.time(), kind, f"{robot.title}: {clean(text)}"))
+
+    def _known_by_name(self, connection: GuardedConnection) -> _Robot:
+        """The robot of a connection. One that is back under its name goes on where it was."""
+        robot = self._robots[connection]
+        if robot.name != connection.robot:
+            robot.name = connection.robot
+            before = next((one for one in self._lost if one.name == robot.name), None)
+            if before is not None:
+                self._lost.remove(before)
+                robot.id, robot.calls = before.id, before.calls + robot.calls
+        return robot
+
+    def _is_back(self, name: str) -> bool:
+        """Whether a robot of that name is connected: its connection before may end later than the next one begins."""
+        return bool(name) and any(robot.name == name for robot in self._robots.values())
+
+    def _count_deadline(self, robot: _Robot, *, missed: bool) -> None:
+        robot.timed, robot.missed = robot.timed + 1, robot.missed + missed
+        self._timed, self._missed = self._timed + 1, self._missed + missed
+
+    async def _make_preview(self, robot: _Robot, message: bytes | None, reply: Reply, timing: Timing) -> None:
         loop, number, last = asyncio.get_running_loop(), robot.calls, robot.last
         assert last is not None
+        make = partial(make_preview, number, last, message, reply.result, reply.state, timing)
         try:
-            robot.preview = await loop.run_in_executor(self._thread, make_preview, number, last, message, reply, timing)
+            robot.preview = await loop.run_in_executor(self._thread, make)
         except Exception:  # a fault of the page must not cost a robot anything
             if not self._faulty:  # once: it may come with every call
                 logger.exception("the page can't show a call")
@@ -217,9 +281,12 @@ class Live:
         return await asyncio.get_running_loop().run_in_executor(self._thread, _frame_of, moment, self._memory)
 
     def _moment(self, sent: Mapping[int, int]) -> _Moment:
+        now = time.time()
+        while self._lost and now - (self._lost[0].lost or now) > LOST_SECONDS:
+            self._lost.popleft()
         latest = sorted(self._robots.values(), key=lambda robot: robot.last or robot.connected)[-ROBOTS:]
         return _Moment(
-            time=time.time(),
+            time=now,
             requests=self._metrics.requests_so_far(),
             clients=len(self._robots),
             waiting=self._queue.waiting,
@@ -228,13 +295,42 @@ class Live:
             errors=self._metrics.errors_so_far(),
             troubles=tuple(self._troubles),
             timings=tuple(self._timings),
-            robots=[_robot_frame(robot, sent) for robot in sorted(latest, key=lambda robot: robot.id)],
+            batches=tuple(self._batches),
+            timed=self._timed,
+            missed=self._missed,
+            robots=[_robot_frame(robot, sent) for robot in sorted([*latest, *self._lost], key=lambda robot: robot.id)],
         )
 
 
 def _robot_frame(robot: _Robot, sent: Mapping[int, int]) -> RobotFrame:
     new = robot.preview if robot.preview is not None and robot.preview.number != sent.get(robot.id) else None
-    return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new, robot.notes)
+    return RobotFrame(
+        id=robot.id,
+        name=clean(robot.name),
+        address=robot.address,
+        connected=robot.connected,
+        lost=robot.lost,
+        how=robot.how,
+        calls=robot.calls,
+        last=robot.last,
+        times=[round(one, 2) for one in robot.times],
+        deadline=robot.deadline,
+        timed=robot.timed,
+        missed=robot.missed,
+        batch=robot.batch,
+        rows=robot.rows,
+        notes=robot.notes,
+        refusal=robot.refusal,
+        preview=new,
+    )
+
+
+def _groups(robot: object, dims: int, names: Sequence[str] | None) -> list[ActionGroup]:
+    """How the page groups the actions: those of a robot that nobody described are one group."""
+    groups = action_groups(str(robot), dims, names)
+    if not groups or groups == known_groups(str(robot)):
+        return groups
+    return [ActionGroup("actions", groups[0].unit, {i: name for one in groups for i, name in one.names.items()})]
 
 
 def _timing(reply: Mapping[str, object], seconds: float) -> Timing:
@@ -261,6 +357,9 @@ def _frame_of(moment: _Moment, memory: Callable[[], Memory]) -> str:
             troubles=list(moment.troubles),
             latency_bin_ms=width,
             latency=latency,
+            batches=dict(Counter(moment.batches)),
+            timed=moment.timed,
+            missed=moment.missed,
             robots=list(moment.robots),
         )
     )

@@ -6,18 +6,18 @@ as text, never as markup.
 
 from typing import Any
 
-from msgspec import Struct, field
+from msgspec import Struct
 
 from turbopi.support.action_groups import ActionGroup
 
-FEED_VERSION = 1
+FEED_VERSION = 2
 
 
 class Hello(Struct, frozen=True, tag="hello", tag_field="kind"):
     """What doesn't change while the server runs.
 
     policy   its metadata, as clients get it
-    actions  how the dimensions of its actions belong together; empty if the metadata doesn't say
+    actions  how the dimensions of its actions belong together, by name; empty if the metadata doesn't say
     """
 
     feed: int
@@ -40,6 +40,7 @@ class Preview(Struct, frozen=True):
     number   of the robot's calls, from 1. Some are left out: a robot may call more often than the feed shows
     time     when its answer had been sent, in seconds since 1970
     actions  [H, d] in the robot's units; empty if they are too many to show
+    state    of the robot, in the order of the metadata's "features"; empty for a policy that doesn't tell
     numbers  the observation's arrays of few numbers, such as its state
     timing   milliseconds of each stage
     note     what isn't shown, and why
@@ -49,22 +50,53 @@ class Preview(Struct, frozen=True):
     time: float
     prompt: str
     actions: list[list[float | None]]
+    state: list[float | None]
     numbers: dict[str, list[float | None]]
-    images: dict[str, Thumbnail] = field(name="pictures")
+    images: dict[str, Thumbnail]
     timing: dict[str, float | None]
     note: str = ""
 
 
+class RobotNote(Struct, frozen=True):
+    """A note of a robot's answer, or why a request got no actions. `names`: of joints or cameras."""
+
+    kind: str  # as in turbopi_notes_total or turbopi_errors_total
+    names: list[str]
+    text: str
+
+
 class RobotFrame(Struct, frozen=True):
-    """A connected robot. `preview`: its last call, if this watcher hasn't had it yet; `notes`: of its last answer."""
+    """A robot that is connected, or was.
+
+    id        one that comes back under its name keeps it, and goes on counting calls
+    name      that it gave itself, "" if none
+    lost      since when it isn't connected; `how` that came
+    times     milliseconds of its last answers, from the observation received to the actions sent
+    deadline  milliseconds, of its last request; None: it gave none
+    timed     requests that gave a deadline; so many of them were `missed`
+    batch     observations in the run of its last answer; `rows` of its last message, if that was a batch
+    notes     of its last answer
+    refusal   why its last request got no actions; None: it got some
+    preview   its last call, if this watcher hasn't had it yet
+    """
 
     id: int
+    name: str
     address: str
-    connected: float  # seconds since 1970, as `last`
+    connected: float  # seconds since 1970, as `last` and `lost`
+    lost: float | None
+    how: str
     calls: int
     last: float | None
-    preview: Preview | None = field(default=None, name="look")
-    notes: list[str] = field(default_factory=list)
+    times: list[float]
+    deadline: float | None
+    timed: int
+    missed: int
+    batch: int
+    rows: int | None
+    notes: list[RobotNote]
+    refusal: RobotNote | None
+    preview: Preview | None
 
 
 class StageTimes(Struct, frozen=True):
@@ -82,7 +114,7 @@ class StageTimes(Struct, frozen=True):
 
 
 class Trouble(Struct, frozen=True):
-    """A request that got no actions, or a note."""
+    """A request that got no actions, or a note. The text begins with the robot."""
 
     time: float
     error: str  # its kind, as in turbopi_errors_total or turbopi_notes_total
@@ -109,6 +141,9 @@ class Frame(Struct, frozen=True, tag="frame", tag_field="kind"):
     troubles: list[Trouble]  # the last ones
     latency_bin_ms: float
     latency: list[StageTimes]
+    batches: dict[int, int]  # observations in a run -> how many of the last answers came from such runs
+    timed: int  # requests that gave a deadline
+    missed: int  # of them
     robots: list[RobotFrame]  # those with the last requests, in the order in which they connected
 
 

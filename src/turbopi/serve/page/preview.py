@@ -1,7 +1,7 @@
 """A preview of one answered call, for people."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from PIL import Image
@@ -17,7 +17,12 @@ ACTIONS = 16_384  # numbers of a chunk
 
 
 def make_preview(
-    number: int, time: float, message: bytes | None, reply: Mapping[str, object], timing: Mapping[str, float]
+    number: int,
+    time: float,
+    message: bytes | None,
+    reply: Mapping[str, object],
+    state: Sequence[float],
+    timing: Mapping[str, float],
 ) -> Preview:
     """What to show of a call: the `message` that was answered, and its `reply`. Never raises for what is in them.
 
@@ -30,6 +35,7 @@ def make_preview(
         time=time,
         prompt=clean(prompt if isinstance(prompt, str) else ""),
         actions=_chunk(reply.get("actions")),
+        state=list(state[:NUMBERS]),
         numbers=_numbers(observation),
         images=_images(observation),
         timing=dict(timing),
