@@ -70,6 +70,8 @@ def test_the_state_is_drawn_in_its_training_range_and_actions_beside_theirs(
     assert [label.get_text() for label in in_range.get_yticklabels()] == ["hip  45", "b  1"]
     assert [np.asarray(line.get_xdata()).tolist() for line in in_range.get_lines()] == [[2], [0.5]]  # far; constant
     assert [-3.0, 2.0] in [np.asarray(line.get_ydata()).tolist() for line in chunk.get_lines()]
+    low, high = chunk.get_ylim()
+    assert low < -3 and high > 2  # though no action is there
     legend = chunk.get_legend()
     assert legend is not None and [text.get_text() for text in legend.get_texts()] == ["left", "right"]
 

@@ -70,7 +70,7 @@ def plot_chunks(
         names = [name for name, _ in action_range.labels]
     groups = action_groups(robot, rows[0].actions.shape[1], names)
     num_images = max(len(row.camera_images) for row in rows)
-    limits = [_limits(group, rows) for group in groups]
+    limits = [_limits(group, rows, action_range) for group in groups]
     drawn_state = state_range if state_range is not None and len(state_range.low) else None
     panels = num_images + (drawn_state is not None)
     widths = [1.0] * num_images + [1.3] * (panels - num_images) + [1.45] * len(groups)
@@ -107,13 +107,16 @@ def as_text(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _limits(group: ActionGroup, rows: Sequence[Row]) -> tuple[float, float]:
-    """What a group's axis shows: its limits, and whatever is beyond them.
+def _limits(group: ActionGroup, rows: Sequence[Row], known: Range | None) -> tuple[float, float]:
+    """What a group's axis shows: its limits, and whatever is beyond them, of all rows and of the training range.
 
-    Without limits the values of all rows, but not less than a fifth of the largest: noise on a constant stays small.
+    Not less than a fifth of the largest: noise on a constant stays small.
     """
     drawn = [chunk for row in rows for chunk in (row.actions, row.oracle, row.expert) if chunk is not None]
     values = np.concatenate([chunk[:, list(group.names)].ravel() for chunk in drawn])
+    if known is not None:
+        of_group = [index for index in group.names if index < len(known.low)]
+        values = np.concatenate([values, known.low[of_group], known.high[of_group]])
     values = values[np.isfinite(values)]
     low, high = group.limits or (np.inf, -np.inf)
     low, high = min(low, values.min(initial=np.inf)), max(high, values.max(initial=-np.inf))
