@@ -210,6 +210,25 @@ def test_robots_come_and_go(page: Page) -> None:
         page.open("about:blank")
 
 
+def test_a_policy_of_another_make_has_its_numbers_shown_without_names(page: Page) -> None:
+    class Other(Arm):
+        gives_readings = False
+
+        def infer(self, obs: dict[str, Any], readings: bool = True) -> dict[str, Any]:
+            answer = super().infer(obs, readings=readings)
+            return {key: value for key, value in answer.items() if key != "reading"}
+
+    for features in ("none", {"state": {"dtype": "float32"}, "actions": [{"name": 3}]}):
+        policy = Other()
+        policy.metadata |= {"features": features, "robot": "other", "robot_action_dim": 7}
+        with running(policy) as server, robot(server, "first"):
+            page.open(address(server))
+            page.until("document.querySelectorAll('.axes polyline').length == 7")
+            assert text(page, ".joint").startswith("dim") and "observation/state: -1.000" in text(page, ".values")
+            assert page.value("document.querySelectorAll('.track, .range').length") == 0
+            page.open("about:blank")
+
+
 def test_the_page_asks_for_the_key_and_says_when_it_is_wrong(page: Page) -> None:
     def give(key: str) -> None:
         page.until("document.querySelector('#ask') && !document.querySelector('#ask').hidden")

@@ -42,10 +42,8 @@ class Checks:
         robot, action_width = pipeline.robot, pipeline.metadata["robot_action_dim"]
         state_width = pipeline.state_scale.width if robot.state_dim is None else robot.state_dim
         judged = stats if judges_ranges or out_of_range != "warn" else NormStats()
-        self._state_labels, self._action_labels = (
-            state_labels(robot, state_width or 0),
-            action_labels(robot, action_width),
-        )
+        self._state_labels = state_labels(robot, state_width or 0)
+        self._action_labels = action_labels(robot, action_width)
         self.state = TrainingRange(judged.state if judges_ranges else None, self._state_labels)
         self.actions = TrainingRange(judged.actions, self._action_labels)
         self._least, self._most = self._normalized(self.actions.least), self._normalized(self.actions.most)
@@ -60,7 +58,7 @@ class Checks:
 
     @functools.cached_property
     def features(self) -> dict[str, list[dict[str, Any]]]:
-        """ "state" and "actions", each number's name, unit and training range, in plain values; None where unknown."""
+        """Of state and actions each number's name, unit and training range, in plain values; None where unknown."""
         state, actions = self.drawn
         return {"state": _plain(self._state_labels, state), "actions": _plain(self._action_labels, actions)}
 
