@@ -109,10 +109,8 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptio
     horizon = _whole(given, "execution_horizon", 0 if mode == "rtc_identity" and "previous" in given else 1)
     guidance = _guidance(given)
     session = given.get("session")
-    if session is not None and not (isinstance(session, str) and 0 < len(session) <= MAX_SESSION):
-        raise ObservationError(
-            f"{PREFIX}session is {session!r:.100}; it should be text of 1 to {MAX_SESSION} characters"
-        )
+    if session is not None:
+        session = as_name("session", session)
     left_over = _left_over(given)
     anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
     previous = None
@@ -179,6 +177,15 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ObservationError(f"{PREFIX}max_guidance_weight is {shown!r:.100}; it should be a number from 0")
         guidance["max_guidance_weight"] = float(weight)
     return guidance
+
+
+def as_name(key: str, value: object, what: str = "") -> str:
+    """A message's name of a session or a robot. Raises ObservationError, which says `what` it should be."""
+    if not (isinstance(value, str) and 0 < len(value) <= MAX_SESSION):
+        raise ObservationError(
+            f"{PREFIX}{key} is {value!r:.100}; it should be {what}text of 1 to {MAX_SESSION} characters"
+        )
+    return value
 
 
 def as_number(value: object) -> int | float | None:

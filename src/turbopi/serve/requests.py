@@ -21,13 +21,13 @@ import numpy as np
 
 from turbopi.policy.watch import READING, Reading, Watch
 from turbopi.realtime.messages import (
-    MAX_SESSION,
     MAX_STEP,
     MOST_NOTES,
     NOTES,
     PREFIX,
     SCHEDULING_KEYS,
     Note,
+    as_name,
     as_number,
     notes_in,
 )
@@ -320,18 +320,14 @@ class RequestHandler:
 
     def _answer(self, request: ClientRequest, results: Sequence[Result]) -> dict[str, Any]:
         """The map to send, of results that all have actions; with "server_timing"."""
-        if request.scheduling.batch is None:
-            (result,) = results
-            assert result.answer is not None
-            server_timing: dict[str, float] = {"infer_ms": result.seconds * 1e3}
-            if result.batch > 1:
-                server_timing["batch"] = result.batch
-            return {**self._real_time.finish(request.plan, result.answer), "server_timing": server_timing}
         answers = [result.answer for result in results if result.answer is not None]
         runs = list({result.run: result for result in results}.values())
-        server_timing = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
+        server_timing: dict[str, float] = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
         if (largest := max(run.batch for run in runs)) > 1:
             server_timing["batch"] = largest
+        if request.scheduling.batch is None:
+            (answer,) = answers
+            return {**self._real_time.finish(request.plan, answer), "server_timing": server_timing}
         timing = sum_timings([run.answer.get(TIMING, {}) for run in runs if run.answer is not None])
         stacked = {**stack_answers(answers), TIMING: timing, "server_timing": server_timing}
         noted = [{**note.plain, "row": row} for row, answer in enumerate(answers) for note in notes_in(answer)]
@@ -393,12 +389,8 @@ class SchedulingOptions:
 
 def read_robot(received: Mapping[str, Any]) -> str:
     """The name that a robot gives itself, "" for none. Raises ObservationError."""
-    name = received.get(f"{PREFIX}robot", "")
-    if f"{PREFIX}robot" in received and not (isinstance(name, str) and 0 < len(name) <= MAX_SESSION):
-        raise ObservationError(
-            f"{PREFIX}robot is {name!r:.100}; it should be the robot's name, text of 1 to {MAX_SESSION} characters"
-        )
-    return str(name)
+    key = f"{PREFIX}robot"
+    return as_name("robot", received[key], "the robot's name, ") if key in received else ""
 
 
 def read_scheduling(

@@ -321,7 +321,7 @@ class PolicyServer:
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
                 continue
-            result, scheduling, notes = reply[:3]
+            result, scheduling, notes, _ = reply
             if previous_total is not None:
                 result["server_timing"]["prev_total_ms"] = previous_total * 1e3
             await connection.send(pack(result))

@@ -15,7 +15,7 @@ class EncodedImage:
 class ViewedCall:
     """One call that got actions.
 
-    robot     who asked: its name, or its address; "" where a recording doesn't tell
+    robot     its name, or its address; "" where a recording doesn't tell
     number    of the robot's calls, from 1; of all, in a recording. Those that are missing have numbers, too
     time      when the answer was sent, in seconds since 1970
     actions   float64[H, d], in the robot's units; None if they can't be shown

@@ -177,13 +177,10 @@ class Live:
         robot, result, scheduling = self._known_by_name(connection), reply.result, reply.scheduling
         robot.calls += 1
         robot.last = time.time()
-        robot.refusal, robot.notes = (
-            None,
-            [
-                RobotNote(note.kind, [clean(name, 60) for name in note.names], clean(note.text))
-                for note in notes_in(result)
-            ],
-        )
+        robot.refusal = None
+        robot.notes = [
+            RobotNote(one.kind, [clean(name, 60) for name in one.names], clean(one.text)) for one in notes_in(result)
+        ]
         robot.deadline = scheduling.deadline * 1e3 if scheduling.firm else None
         robot.batch, robot.rows = int(result["server_timing"].get("batch", 1)), scheduling.batch
         if scheduling.firm:
