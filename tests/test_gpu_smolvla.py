@@ -1,4 +1,6 @@
-"""SmolVLA on a GPU: backend `cuda_graph` gives what the reference does, and LeRobot's actions."""
+"""SmolVLA on a GPU: backend `cuda_graph` gives LeRobot's actions, `fused` what the reference does."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from smolvla_golden import GoldenRuns, make_checkpoint, make_hub
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Guidance
 from turbopi.support.errors import ObservationError
@@ -79,3 +82,70 @@ def test_a_conditioned_loop_and_a_batch_equal_the_references(checkpoints: dict[s
     several = [golden.observation(run) for run in range(2)]
     rows = [policy.infer_batch(several, seed=1, conditioning=[None, pull]) for policy in (captured, plain)]
     assert all(relative(a["actions"], b["actions"]) <= 2e-5 for a, b in zip(*rows, strict=True))
+
+
+# -- fused: its kernels take heads of at least 16 columns, which the golden models haven't; so the published sizes -----
+
+
+@pytest.fixture(scope="module")
+def published() -> Checkpoint:
+    return random_checkpoint("smolvla_base")
+
+
+@pytest.fixture(scope="module")
+def policies(published: Checkpoint) -> dict[str, UnifiedPolicy]:
+    return {
+        "exact": UnifiedPolicy(published, backend="pytorch", precision="f32"),
+        "ordinary": UnifiedPolicy(published, backend="pytorch"),
+        "fused": UnifiedPolicy(published),
+    }
+
+
+def seen(policy: UnifiedPolicy, seed: int, cameras: int, prompt: str) -> dict[str, Any]:
+    observation = policy.example_observation(seed)
+    names = [name for name, value in observation.items() if isinstance(value, np.ndarray) and value.ndim == 3]
+    left = {name: value for name, value in observation.items() if name not in names[cameras:]}
+    return {**left, "prompt": prompt}
+
+
+@pytest.mark.parametrize(("cameras", "prompt"), [(1, "a"), (2, "put the red cup on the plate " * 3), (3, "open it")])
+def test_fused_is_as_near_to_float32_as_ordinary_bfloat16(
+    policies: dict[str, UnifiedPolicy], cameras: int, prompt: str
+) -> None:
+    observation = seen(policies["exact"], 3, cameras, prompt)
+    noise = np.random.default_rng(5).normal(size=(50, 32)).astype(np.float32)
+    exact, ordinary, fused = (policies[name].infer(observation, noise=noise)["actions"] for name in policies)
+    assert 0 < relative(fused, exact) <= 1.5 * relative(ordinary, exact)
+    assert policies["fused"].metadata["backend"] == "fused"
+
+
+def test_every_intermediate_of_fused_is_as_near(policies: dict[str, UnifiedPolicy]) -> None:
+    observation = Observation.stack([policies["exact"].prepare(seen(policies["exact"], 7, 2, "go there"))])
+    noise = torch.from_numpy(np.random.default_rng(6).normal(size=(1, 50, 32)).astype(np.float32))
+    traces = [policies[name].backend.intermediates(observation, noise, 10) for name in policies]
+    for name in ("kv_k", "kv_v", "x_t", "v_t", "actions"):
+        exact, ordinary, fused = (trace[name].float().cpu().numpy() for trace in traces)
+        assert relative(fused, exact) <= 1.5 * relative(ordinary, exact), name
+
+
+def test_a_loop_of_other_steps_and_actions_and_a_conditioned_one(policies: dict[str, UnifiedPolicy]) -> None:
+    observation = seen(policies["exact"], 4, 2, "close it")
+    target, weights = np.full((50, 32), 0.3, np.float32), np.linspace(1, 0, 50, dtype=np.float32)
+    pull = Conditioning(guidance=Guidance(target, weights, np.ones((10, 50), np.float32), "identity"))
+    every: tuple[dict[str, Any], ...] = ({"num_steps": 3}, {"horizon": 20}, {"conditioning": pull})
+    for options in every:
+        exact, ordinary, fused = (policies[name].infer(observation, seed=2, **options)["actions"] for name in policies)
+        assert relative(fused, exact) <= 1.5 * relative(ordinary, exact), options
+    again = [policies["fused"].infer(observation, seed=2)["actions"] for _ in range(2)]
+    assert np.array_equal(*again)
+
+
+def test_a_strict_fused_policy_runs_what_was_warmed_up(published: Checkpoint) -> None:
+    policy = UnifiedPolicy(published, backend="fused", strict=True)
+    observation = seen(policy, 1, 2, "go")
+    with pytest.raises(ObservationError, match="warmup"):
+        policy.infer(observation)
+    policy.warmup(cameras=[2])
+    assert np.isfinite(policy.infer(observation)["actions"]).all()
+    with pytest.raises(ObservationError, match="warmup"):
+        policy.infer(observation, num_steps=7)

@@ -158,14 +158,19 @@ def test_blocks_that_wait_in_vain_give_up_and_say_where(monkeypatch: pytest.Monk
 
 
 def test_a_barriers_number_names_its_place() -> None:
-    layers = 3
-    a_step = (
-        ["embed"] + [f"phase {one} of layer {i}" for i in range(layers) for one in denoise.PHASES[:6]] + ["advance"]
-    )
+    sizes = {"TP_SPLITS": 2, "TP_DEPTH": 3, "TP_MODULATED": 1}
+    a_step = denoise.phases(sizes)
+    assert a_step == [
+        "embed",
+        *(f"phase {one} of layer {i}" for i in range(3) for one in denoise.PHASES[:6]),
+        "advance",
+    ]
     for number, where in enumerate([*a_step, *a_step], 1):
         step = (number - 1) // len(a_step)
-        assert str(denoise.stuck(number, layers)).endswith(f"behind {where} in step {step}")
-    assert denoise.stuck(0, layers) is None
+        assert str(denoise.stuck(number, a_step)).endswith(f"behind {where} in step {step}")
+    assert denoise.stuck(0, a_step) is None
+    mixed = denoise.phases(sizes | {"TP_SPLITS": 1, "TP_MODULATED": 0})
+    assert mixed[:3] == ["embed", "mix", "phase qkv of layer 0"] and len(mixed) == 2 + 5 * 3 + 1
 
 
 def test_choices_of_a_launch_change_no_more_than_the_order_of_sums(

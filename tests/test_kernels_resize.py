@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 from conftest import gpu_or_interpreter
-from test_resize import SIDE, SIZES, WAYS, camera_image
+from test_resize import SIDE, SIZES, camera_image
 
 from turbopi.config import ImageResize
 from turbopi.engine.resize import Resizer
-from turbopi.preprocess.images import RESIZES, fitted
+from turbopi.preprocess.images import WAYS as ALL_WAYS
+from turbopi.preprocess.images import fitted
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
@@ -24,7 +25,7 @@ side = SIDE if ON_GPU else 28  # the interpreter is slow
 
 def resized(given: Sequence[np.ndarray | None], way: ImageResize) -> np.ndarray:
     """None: a camera whose image stays, which is 77 everywhere."""
-    dtype = torch.float32 if RESIZES[way].float_images else torch.uint8
+    dtype = torch.float32 if ALL_WAYS[way].float_images else torch.uint8
     images = torch.full((len(given), side, side, 3), 77, dtype=dtype, device=DEVICE)
     resizer = Resizer(images)
     resizer.upload(given, way)
@@ -33,14 +34,14 @@ def resized(given: Sequence[np.ndarray | None], way: ImageResize) -> np.ndarray:
 
 
 def check(found: np.ndarray, image: np.ndarray, way: ImageResize) -> None:
-    if RESIZES[way].float_images and not ON_GPU:  # the interpreter has no fused multiply-add
+    if ALL_WAYS[way].float_images and not ON_GPU:  # the interpreter has no fused multiply-add
         np.testing.assert_allclose(found, fitted(image, side, way), rtol=0, atol=1e-6)
     else:
         np.testing.assert_array_equal(found, fitted(image, side, way))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", ALL_WAYS)
 @pytest.mark.parametrize("size", SIZES if ON_GPU else ((37, 53), (28, 80), (100, 61)))
 def test_pictures_are_resized_as_on_a_cpu(size: tuple[int, int], way: ImageResize) -> None:
     image = camera_image(*size)

@@ -14,6 +14,7 @@ import torch
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
 from turbopi.config import Network
 from turbopi.engine.graph import preparing
+from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS, format_of
 from turbopi.support import extensions
@@ -75,6 +76,7 @@ _SPECS = (
         "turbopi.backends.fused",
         "FusedBackend",
         "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; FP8 from 8.9 on, INT8 below",
+        unplanned="turbopi.backends.fused_smolvla:FusedSmolVLABackend",
     ),
     BackendSpec(
         "emulated_fp8",
@@ -187,12 +189,18 @@ def choose(device: torch.device, precision: Precision = "bf16", model: Network |
             continue
         reason = availability(name, device) or _unproven(name, device)
         if reason is None and model is not None:
-            reason = class_for(name, model).refuses_model(model)
+            reason = _refuses(class_for(name, model), model, precision)
         if reason is None:
             skipped = f" ({'; '.join(reasons)})" if reasons else ""
             return name, f"auto: the fastest backend for this GPU and precision{skipped}"
         reasons.append(f"not {name}: {reason}")
     return "pytorch", f"auto: {'; '.join(reasons)}"
+
+
+def _refuses(cls: type[Backend], model: Network, precision: Precision) -> str | None:
+    if (why := cls.refuses_model(model)) is not None or precision in cls.precisions:
+        return why
+    return f"it runs {family_of(model).label} in {' or '.join(cls.precisions)}"
 
 
 def _unproven(name: str, device: torch.device) -> str | None:
@@ -248,6 +256,8 @@ def create(
     cls = class_for(name, config)
     if (why := cls.refuses_model(config)) is not None:
         raise BackendUnavailable(why)
+    if (why := _refuses(cls, config, precision)) is not None:
+        raise ConfigError(f"backend {name!r} can't run in {precision!r} here: {why}")
     with preparing(device):
         return cls(config, load, device=device, precision=precision, quantization=quantization)
 

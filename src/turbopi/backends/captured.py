@@ -22,9 +22,10 @@ from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.config import ImageResize
 from turbopi.engine.graph import Graph, building
 from turbopi.engine.plan import cold_call
+from turbopi.engine.resize import Resizer
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, of_rows
-from turbopi.models.pi0.integrate import Integrated, integrate
+from turbopi.models.pi0.integrate import integrate
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.preprocess.images import fit_unit
 from turbopi.support.errors import BackendError
@@ -43,20 +44,34 @@ class _Step:
     graph: Graph
 
 
-@dataclass
-class _Graphs:
-    """Of so many cameras: the inputs' places, what the prefix leaves, and the steps behind it by horizon.
+@dataclass(frozen=True)
+class Answer:
+    """Actions float32[1, H, A], on the device; each evaluation's x_t and v_t, of the same shape, if they were kept."""
 
-    behind  what the expert makes of the cache once a call
+    actions: Tensor
+    evaluations: list[tuple[Tensor, Tensor]]
+
+
+@dataclass
+class Graphs:
+    """Of so many cameras: the inputs' places, what the prefix leaves, and what is captured behind it.
+
+    resizer what the vision graph resizes bytes by; None: it doesn't
+    behind  what the reference's expert makes of the cache once a call
+    more    what else a backend's prefix leaves
     steps   (horizon, whether each action has its own time) -> step
+    loops   (horizon, steps) -> a backend's whole loop
     """
 
     inputs: Observation
+    resizer: Resizer | None
     vision: Graph
     prefix: Graph
     cache: KVCache
     behind: Any
+    more: Any
     steps: dict[tuple[int, bool], _Step] = field(default_factory=dict)
+    loops: dict[tuple[int, int], Any] = field(default_factory=dict)
 
 
 class CapturedBackend(PyTorchBackend):
@@ -76,7 +91,7 @@ class CapturedBackend(PyTorchBackend):
         super().load_weights(load)
         if self.precision == "bf16":
             self.model.attend = _attend
-        self._graphs: dict[int, _Graphs] = {}  # by number of cameras
+        self._graphs: dict[int, Graphs] = {}  # by number of cameras
         self._pool = torch.cuda.graph_pool_handle()
         self._stream: torch.cuda.Stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
         self._times: dict[bytes, Tensor] = {}
@@ -134,8 +149,8 @@ class CapturedBackend(PyTorchBackend):
             cache = self._graphs[len(images[row])].cache
             assert cache.mask is not None
             trace = {name: part[:, :, :, cache.mask[0]].transpose(2, 3) for name, part in _parts(cache)}
-            trace["x_t"] = torch.stack([x for x, _, _ in done.evaluations] + [done.actions])
-            trace["v_t"] = torch.stack([v for _, _, v in done.evaluations])
+            trace["x_t"] = torch.stack([x for x, _ in done.evaluations] + [done.actions])
+            trace["v_t"] = torch.stack([v for _, v in done.evaluations])
             traces.append(trace | {"actions": done.actions})
         return {name: _joined([one[name] for one in traces], int(name != "actions")) for name in traces[0]}
 
@@ -149,12 +164,15 @@ class CapturedBackend(PyTorchBackend):
         if self.strict and len(images) not in self._graphs:
             raise self._cold(len(images), self.config.action_horizon)
         graphs = self._captured(len(images))
-        for image, place in zip(images, graphs.inputs.images[0], strict=True):
+        places = graphs.inputs.images[0]
+        for image, place in zip(images, places, strict=True):
             if image.dtype == np.float32:  # as the model reads it
                 place.copy_(torch.from_numpy(image))
-            else:
+            elif graphs.resizer is None:
                 on_device = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
                 place.copy_(fit_unit(on_device[None].float() / 255, tuple(place.shape[:2]), resize)[0])
+        if graphs.resizer is not None:
+            graphs.resizer.upload([None if one.dtype == np.float32 else one for one in images], resize)
         graphs.vision.launch()
         self._turn = object()
         return self._turn
@@ -171,8 +189,8 @@ class CapturedBackend(PyTorchBackend):
         timer: StageTimer,
         *,
         keep: bool = False,
-    ) -> Integrated:
-        """Its actions, on the device; keep: and all that led to them."""
+    ) -> Answer:
+        """Its actions; keep: and all that led to them."""
         if turn is not self._turn:
             raise BackendError("another observation was begun before this one was finished")
         graphs, count = self._captured(cameras), len(tokens)
@@ -184,7 +202,20 @@ class CapturedBackend(PyTorchBackend):
         graphs.inputs.state.copy_(torch.from_numpy(state)[None])
         graphs.prefix.launch()
         timer.mark("prefix")
+        x_1 = torch.from_numpy(noise)[None].to(self.device)
+        answer = self._denoise(graphs, cameras, x_1, num_steps, conditioning, keep)
+        timer.mark("denoise")
+        return answer
 
+    def _denoise(
+        self,
+        graphs: Graphs,
+        cameras: int,
+        x_1: Tensor,
+        num_steps: int,
+        conditioning: Conditioning | None,
+        keep: bool,
+    ) -> Answer:
         def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
             if self.strict and (x.shape[1], time.ndim == 3) not in graphs.steps:
                 raise self._cold(cameras, x.shape[1], conditioned=time.ndim == 3)
@@ -194,31 +225,32 @@ class CapturedBackend(PyTorchBackend):
             step.graph.launch()
             return step.v, step.v.clone()
 
-        x_1 = torch.from_numpy(noise)[None].to(self.device)
         grid = self.config.time_grid
         with torch.no_grad():
             done = integrate(velocity, self._embed_times, x_1, num_steps, conditioning, grid=grid, keep=keep)
-        timer.mark("denoise")
-        return done
+        return Answer(done.actions, [(x, v) for x, _, v in done.evaluations])
 
     # -- graphs --------------------------------------------------------------------------------------------------------
 
     def _stage(self, stage: Callable[..., Any]) -> Callable[..., Any]:
         return compile_stage(stage, dynamic=False) if self._compiles else stage
 
-    def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any]:
+    def _vision(self, images: Tensor, mark: Callable[[str], None]) -> Tensor:
+        return self._embed_images(images)
+
+    def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, Any]:
         prefix = self.model.embed_prefix(observation, embedded=embedded)
         k, v, _ = self.model.encode_prefix(prefix)
         cache = self.model.cache_of(prefix, k, v)
-        return cache, self.model.cross_keys_values(cache)
+        return cache, self.model.cross_keys_values(cache), None
 
-    def _captured(self, cameras: int) -> _Graphs:
+    def _captured(self, cameras: int) -> Graphs:
         if cameras not in self._graphs:
             with building(self.device), torch.no_grad():
                 self._graphs[cameras] = self._capture(cameras)
         return self._graphs[cameras]
 
-    def _capture(self, cameras: int) -> _Graphs:
+    def _capture(self, cameras: int) -> Graphs:
         config, side, prompt = self.config, self.config.image_size, self.config.max_prompt_tokens
         inputs = Observation(
             torch.zeros(1, cameras, side, side, 3),
@@ -228,10 +260,16 @@ class CapturedBackend(PyTorchBackend):
             torch.zeros(1, config.state_dim),
         ).to(self.device)
         images: list[Tensor] = []
-        left: list[tuple[KVCache, Any]] = []
+        left: list[tuple[KVCache, Any, Any]] = []
+
+        resizer = Resizer(inputs.images[0]) if self._compiles else None  # Triton's kernel needs a compiler, too
 
         def vision(mark: Callable[[str], None]) -> None:
-            images[:] = [self._embed_images(inputs.images[0])]
+            if resizer is not None:
+                from turbopi.kernels.portable.resize import resize_images
+
+                resize_images(resizer.table, inputs.images[0])
+            images[:] = [self._vision(inputs.images[0], mark)]
             mark("vision")
 
         def prefix(mark: Callable[[str], None]) -> None:
@@ -240,9 +278,9 @@ class CapturedBackend(PyTorchBackend):
 
         first = Graph(vision, self._pool, self._stream)
         second = Graph(prefix, self._pool, self._stream)
-        return _Graphs(inputs, first, second, *left[0])
+        return Graphs(inputs, resizer, first, second, *left[0])
 
-    def _step(self, graphs: _Graphs, horizon: int, *, by_action: bool) -> _Step:
+    def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> _Step:
         if (horizon, by_action) not in graphs.steps:
             x = torch.zeros(1, horizon, self.config.action_dim, device=self.device)
             time = self._embed_times(np.ones(1, np.float32))
@@ -259,7 +297,11 @@ class CapturedBackend(PyTorchBackend):
         return graphs.steps[horizon, by_action]
 
     def _cold(self, cameras: int, horizon: int, *, conditioned: bool = False) -> Exception:
-        warm = [f"{count} cameras, H={h}" for count, one in self._graphs.items() for h, _ in one.steps]
+        warm = [
+            f"{count} cameras, H={h}"
+            for count, one in self._graphs.items()
+            for h in {h for h, _ in (*one.steps, *one.loops)}
+        ]
         needs = f"{cameras} cameras, H={horizon}"
         return cold_call(self.name, needs, warm, conditioned=conditioned, cameras=cameras, horizons=horizon)
 

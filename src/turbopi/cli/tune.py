@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from turbopi.backends.tuned_tiles import Machine, TunedTile
-    from turbopi.config import ModelConfig
+    from turbopi.config import Network
     from turbopi.kernels.tile_table import TileTable
     from turbopi.tune.plan import Plan
     from turbopi.tune.run import Measured, Outcome
@@ -82,7 +82,7 @@ def tune(
     if checkpoint is None and options.random_weights is None:
         options = WeightOptions(SIZES, options.weights_seed, options.config)
     resolved = usable_device(device)
-    config = options.open(checkpoint).config.planned_model
+    config = options.open(checkpoint).config.model
     from turbopi.backends.tuned_tiles import Machine, find_tiles, own_file, write_tile_file
     from turbopi.kernels.tile_table import NO_TILES, TileTable
     from turbopi.tune import plan as planning
@@ -138,7 +138,7 @@ def numbers(text: str, option: str, known: Sequence[int] = ()) -> list[int]:
     return list(dict.fromkeys(found))
 
 
-def prompts_within(prompts: list[int], config: "ModelConfig") -> list[int]:
+def prompts_within(prompts: list[int], config: "Network") -> list[int]:
     """Raises ConfigError for a prompt that is longer than the model's longest."""
     if any(tokens > config.max_prompt_tokens for tokens in prompts):
         raise ConfigError(f"--prompt-tokens is {max(prompts)}; this model takes up to {config.max_prompt_tokens}")
@@ -185,7 +185,7 @@ def refuse_if_busy(device: "torch.device", noisy: bool) -> None:
 
 def measure(
     plan: "Plan",
-    config: "ModelConfig",
+    config: "Network",
     device: "torch.device",
     tiles: "TileTable",
     keep: "Callable[[Sequence[Measured]], None]",

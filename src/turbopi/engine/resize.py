@@ -3,6 +3,7 @@
 Sources: Pillow's `Resample.c` (precompute_coeffs, normalize_coeffs_8bpc), PyTorch's `UpSampleKernel.cpp`.
 """
 
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from turbopi.config import ImageResize
 from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
-from turbopi.preprocess.images import RESIZES, copy_image, placement
+from turbopi.preprocess.images import WAYS, copy_image, placement
 
 MOST_SIZES = 16  # of images whose weights are cached
 
@@ -27,7 +28,9 @@ class Resizer:
         self._rows = self._host.numpy()
         self.table = torch.zeros_like(self._host, device=self._device)
         self._staged: list[tuple[Tensor, Tensor] | None] = [None] * len(images)  # bytes on the host and on the device
-        self._taps: OrderedDict[tuple[int, int, bool], tuple[Taps, Taps, int, int]] = OrderedDict()  # see `_place`
+        self._taps: OrderedDict[tuple[int, int, bool, bool], tuple[Taps, Taps, int, int]] = (
+            OrderedDict()
+        )  # see `_place`
 
     def upload(self, images: Sequence[np.ndarray | None], resize: ImageResize) -> None:
         """Send images uint8[h, w, 3], without waiting; None: `images` stays as it is. All may change afterwards.
@@ -37,21 +40,23 @@ class Resizer:
         rows = np.zeros_like(self._rows)
         for camera, image in enumerate(images):
             if image is not None:
-                rows[camera] = self._send(camera, image, RESIZES[resize].low)
+                rows[camera] = self._send(camera, image, resize)
         if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
             self._rows[:] = rows
             self.table.copy_(self._host, non_blocking=True)
 
-    def _send(self, camera: int, image: np.ndarray, low: float) -> tuple[int, ...]:
+    def _send(self, camera: int, image: np.ndarray, resize: ImageResize) -> tuple[int, ...]:
         """A row of the table."""
-        rows, columns, top, left = self._place(image.shape[0], image.shape[1])
+        way = WAYS[resize]
+        low = 0 if way.low == -math.inf else int(way.low)  # of bytes nothing is below 0
+        rows, columns, top, left = self._place(image.shape[0], image.shape[1], way.centred)
         host, device = self._stage(camera, image.size)
         copy_image(image, host.numpy().reshape(image.shape))
         device.copy_(host, non_blocking=True)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
         sizes = (image.shape[1], image.shape[0], columns.weights.shape[1], rows.weights.shape[1])
         filled = (len(rows.first), len(columns.first))
-        return device.data_ptr(), *(one.data_ptr() for one in taps), *sizes, top, left, *filled, int(low)
+        return device.data_ptr(), *(one.data_ptr() for one in taps), *sizes, top, left, *filled, low
 
     def _stage(self, camera: int, size: int) -> tuple[Tensor, Tensor]:
         staged = self._staged[camera]
@@ -61,12 +66,12 @@ class Resizer:
         host, device = staged
         return host[:size], device[:size]
 
-    def _place(self, height: int, width: int) -> tuple[Taps, Taps, int, int]:
+    def _place(self, height: int, width: int, centred: bool) -> tuple[Taps, Taps, int, int]:
         """Taps of rows and columns, and where the image begins. Those used last are cached, at least a call's own."""
-        key = (height, width, self._images.dtype == torch.uint8)
+        key = (height, width, self._images.dtype == torch.uint8, centred)
         if key not in self._taps:
-            rows, columns = placement((height, width, 3), tuple(self._images.shape[1:]))
-            made = taps_of(height, rows, *key[2:]), taps_of(width, columns, *key[2:])
+            rows, columns = placement((height, width, 3), tuple(self._images.shape[1:]), centred)
+            made = taps_of(height, rows, key[2]), taps_of(width, columns, key[2])
             down, across = (Taps(one.first.to(self._device), one.weights.to(self._device)) for one in made)
             self._taps[key] = down, across, rows.start, columns.start
             if len(self._taps) > MOST_SIZES:

@@ -46,7 +46,7 @@ RESIZES: dict[ImageResize, _Way] = {
     "openpi": _Way(False, 0),
     "lerobot": _Way(True, -1),
     "lerobot_0.4": _Way(True, -3, low=-1.0),
-}  # those that the engine's kernels know, too
+}  # Pi0's
 WAYS: dict[ImageResize, _Way] = RESIZES | {
     "lerobot_smolvla": _Way(True, -1, low=-math.inf, high=math.inf, centred=False),
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from turbopi.backends.tuned_tiles import Machine
-from turbopi.config import ModelConfig
+from turbopi.config import ModelConfig, Network
 from turbopi.kernels.ops import forced_portable
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 from turbopi.kernels.tile_checks import HOPPER
@@ -61,7 +61,7 @@ def precisions_to_tune(requested: Sequence[str], capability: tuple[int, int]) ->
 
 
 def plan(
-    config: ModelConfig,
+    config: Network,
     calls: Sequence[Call],
     precisions: Sequence[Precision],
     kernels: Sequence[Kernels],
@@ -92,7 +92,7 @@ def planned(one: Operation, machine: Machine, shipped: TileTable) -> Planned:
     return Planned(one, usual_first(candidates, key, shipped))
 
 
-def bench_maker(config: ModelConfig, device: torch.device) -> Callable[[Operation, TileTable], Bench]:
+def bench_maker(config: Network, device: torch.device) -> Callable[[Operation, TileTable], Bench]:
     """What puts an operation's inputs on the device; other operations have those tiles."""
     gc.freeze()  # capturing a graph may collect garbage, each time through all that is imported
     made: dict[LayersOf, ExpertLayers] = {}  # the last ones
@@ -104,6 +104,7 @@ def bench_maker(config: ModelConfig, device: torch.device) -> Callable[[Operatio
                 return alone
             of = LayersOf.of(one)
             if of not in made:
+                assert isinstance(config, ModelConfig), "no other expert is operations"
                 made.clear()
                 made[of] = ExpertLayers(config, of, device)
             return InLayers(alone, made[of], tiles)

@@ -8,14 +8,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from turbopi.config import ModelConfig
+from turbopi.config import ModelConfig, Network, VisionConfig
 from turbopi.engine.call import places_of_parts
 from turbopi.engine.forward import HEAD_LAYERS, row_chunks
 from turbopi.engine.plan import BUCKET, bucket
 from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
 from turbopi.models import family_of
+from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.quantization.fp8 import whole_lines
+from turbopi.support.errors import ConfigError
 
 Precision = Literal["bf16", "fp8"]
 Norm = Literal["layer", "rms"]
@@ -82,7 +84,7 @@ class Operation:
         return f"{self.rows} x {self.columns} x {self.inner}"
 
 
-def calls(config: ModelConfig, cameras: Sequence[int], prompts: Sequence[int], batches: Sequence[int]) -> list[Call]:
+def calls(config: Network, cameras: Sequence[int], prompts: Sequence[int], batches: Sequence[int]) -> list[Call]:
     """Every combination, the first prompt length of all of them first: what matters most.
 
     Without `prompts` those of one observation are of every length, those of batches of the usual one.
@@ -97,7 +99,7 @@ def calls(config: ModelConfig, cameras: Sequence[int], prompts: Sequence[int], b
     ]
 
 
-def every_prompt(config: ModelConfig) -> list[int]:
+def every_prompt(config: Network) -> list[int]:
     """All buckets, that of the usual 48 tokens first."""
     longest = bucket(config.max_prompt_tokens)
     usual = min(48, longest)
@@ -105,9 +107,16 @@ def every_prompt(config: ModelConfig) -> list[int]:
 
 
 def operations(
-    config: ModelConfig, call: Call, precision: Precision, kernels: Kernels, *, steps: int = 10, horizon: int = 10
+    config: Network, call: Call, precision: Precision, kernels: Kernels, *, steps: int = 10, horizon: int = 10
 ) -> list[Operation]:
-    """Those of one call whose tiles can be chosen. `horizon` and `steps` matter to batches alone."""
+    """Those of one call whose tiles can be chosen. `horizon` and `steps` matter to batches alone.
+
+    Raises ConfigError for a family that has none.
+    """
+    if isinstance(config, SmolVLAConfig):
+        return [one for one in _smolvla(config, call, precision, kernels) if _has_choice(one)]
+    if not isinstance(config, ModelConfig):
+        raise ConfigError(f"{family_of(config).label} runs no operations whose tiles can be chosen")
     found = [*_vision(config, call, precision, kernels), *_prefix(config, call, precision, kernels)]
     if call.batch > 1:
         found += _expert(config, call, precision, kernels, steps, horizon + family_of(config).state_token)
@@ -128,23 +137,52 @@ def _has_choice(one: Operation) -> bool:
 
 
 def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
-    v, fp8, hopper = config.vision, precision == "fp8", kernels == "hopper"
+    v = config.vision
+    for images, layers in _image_parts(config, call.cameras * call.batch):
+        yield from _vision_layers(v, images, v.num_tokens, layers, precision, kernels)
+        if images == call.cameras * call.batch:
+            linear, rows = "bias" if kernels == "hopper" else "plain", images * v.num_tokens
+            projector = Operation("projector", kernels, linear, "bf16", rows, config.vlm.width, v.width, 1, bias=True)
+            yield replace(projector, norm_in_front="layer")
+
+
+def _vision_layers(
+    v: VisionConfig, images: int, tokens: int, layers: int, precision: Precision, kernels: Kernels
+) -> Iterator[Operation]:
+    """tokens: of an image"""
+    fp8, hopper, rows = precision == "fp8", kernels == "hopper", images * tokens
     linear, residual = ("bias", "residual") if hopper else ("plain", "parts")
     hidden = v.mlp_dim if precision == "bf16" else whole_lines(v.mlp_dim)  # see `engine.weights`
-    for images, layers in _image_parts(config, call.cameras * call.batch):
-        rows = images * v.num_tokens
-        usual = Operation("", kernels, linear, precision, rows, v.width, v.width, layers, bias=True)
-        yield replace(usual, name="vision qkv", columns=3 * v.width, norm_in_front="layer")
-        if not hopper:
-            attention = replace(usual, operation="vision_attention", numbers="bf16", bias=False, images=images)
-            yield replace(attention, name="vision attention", columns=v.num_heads, inner=v.head_dim, out_fp8=fp8)
-        yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
-        fc1 = replace(usual, name="vision fc1", operation="gelu", columns=hidden, out_fp8=fp8)
-        yield replace(fc1, norm_in_front="layer")
-        yield replace(usual, name="vision fc2", operation=residual, inner=hidden, norm_behind="layer")
-        if images == call.cameras * call.batch:
-            projector = replace(usual, name="projector", numbers="bf16", columns=config.vlm.width, uses=1)
-            yield replace(projector, norm_in_front="layer")
+    usual = Operation("", kernels, linear, precision, rows, v.width, v.width, layers, bias=True)
+    yield replace(usual, name="vision qkv", columns=3 * v.width, norm_in_front="layer")
+    if not hopper:
+        attention = replace(usual, operation="vision_attention", numbers="bf16", bias=False, images=images)
+        yield replace(attention, name="vision attention", columns=v.num_heads, inner=v.head_dim, out_fp8=fp8)
+    yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
+    fc1 = replace(usual, name="vision fc1", operation="gelu", columns=hidden, out_fp8=fp8)
+    yield replace(fc1, norm_in_front="layer")
+    yield replace(usual, name="vision fc2", operation=residual, inner=hidden, norm_behind="layer")
+
+
+def _smolvla(config: SmolVLAConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
+    """Of one observation in bfloat16, which is how it runs. Prompts of all lengths have as many places."""
+    if call.batch > 1 or precision != "bf16":
+        return
+    v, text, factor = config.vision, config.text, config.scale_factor**2
+    patches = (config.image_size // v.patch_size) ** 2
+    yield from _vision_layers(v, call.cameras, patches, v.depth, precision, kernels)
+    rows, width, uses = call.cameras * patches // factor, text.width, text.depth - 1
+    yield Operation("projector", kernels, "plain", precision, rows, width, factor * v.width, 1)
+    around = len(config.image_start) + len(config.image_end)
+    rows += call.cameras * around + config.max_prompt_tokens + 1
+    heads, kv = text.num_heads * text.head_dim, 2 * text.num_kv_heads * text.head_dim
+    usual = Operation("", kernels, "plain", precision, rows, heads + kv, width, uses)
+    normed = replace(usual, norm_in_front="rms")
+    yield replace(normed, name="prefix qkv")
+    yield replace(normed, name="prefix last k, v", columns=kv, uses=1)
+    yield replace(usual, name="prefix out", operation="parts", columns=width, inner=heads, norm_behind="rms")
+    yield replace(normed, name="prefix gate, up", columns=2 * text.mlp_dim)
+    yield replace(usual, name="prefix down", operation="parts", columns=width, inner=text.mlp_dim, norm_behind="rms")
 
 
 def _image_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:

@@ -130,10 +130,14 @@ class Vision(VisionTower):
         rows, columns = images.shape[1] // p, images.shape[2] // p
         patches = images.reshape(n, rows, p, columns, p, 3).permute(0, 1, 3, 5, 2, 4).flatten(3).flatten(1, 2)
         x = F.linear(patches, self.patch_embedding.weight.flatten(1), self.patch_embedding.bias)
-        table = self.config.image_size // p
-        row = torch.arange(rows, device=x.device) * table // rows
-        column = torch.arange(columns, device=x.device) * table // columns
-        return x + self.position_embedding((row[:, None] * table + column).flatten())
+        return x + self.positions(rows, columns)
+
+    def positions(self, rows: int, columns: int) -> Tensor:
+        """The position table at a grid of patches, [rows * columns, W]."""
+        table, device = self.config.image_size // self.config.patch_size, self.position_embedding.weight.device
+        row = torch.arange(rows, device=device) * table // rows
+        column = torch.arange(columns, device=device) * table // columns
+        return self.position_embedding((row[:, None] * table + column).flatten())
 
 
 class Text(nn.Module):

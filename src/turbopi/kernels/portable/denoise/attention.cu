@@ -19,7 +19,10 @@ struct Keys {
 // What a warp reads first of its share: asked for before the barrier, as far as it is the prefix's. The rest, of the
 // suffix, comes behind it.
 struct First {
-  uint4 keys[LOGIT_STEPS], values[4];
+  uint4 keys[KEYS_AHEAD][LOGIT_STEPS], values[VALUES_AHEAD][4];
+};
+struct Queries {  // of a lane: rows g and g + 8 of the tile
+  uint4 low[LOGIT_STEPS], high[LOGIT_STEPS];
 };
 __device__ __forceinline__ int key_of(int thread, int tile) { return tile * 8 + thread % 32 / 4; }
 __device__ __forceinline__ int value_of(int thread, int step, int i) { return step * 16 + thread % 4 * 2 + i % 2 + i / 2 * 8; }
@@ -27,32 +30,53 @@ __device__ __forceinline__ int value_column(int thread) { return thread / 32 % D
 
 template <bool PREFIX>
 __device__ __forceinline__ void ask_first(int thread, First& first, const Keys& keys, const Keys& values, int begin, int count) {
-  const int key = key_of(thread, thread / 32), group = thread / 32 / DIM_GROUPS;
-  if (PREFIX || (begin + key >= keys.length && key < count))
+  const int group = thread / 32 / DIM_GROUPS;
 #pragma unroll
-    for (int i = 0; i < LOGIT_STEPS; ++i)
-      first.keys[i] =
-          keys.load(begin + key, i * 32 + thread % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
+  for (int n = 0; n < KEYS_AHEAD; ++n) {
+    const int key = key_of(thread, thread / 32 + n * WARPS);
+    if (PREFIX || (begin + key >= keys.length && key < count))
 #pragma unroll
-  for (int i = 0; i < 4; ++i) {
-    const int at = value_of(thread, group, i);
-    if (PREFIX || (begin + at >= keys.length && at < count))
-      first.values[i] = values.load(begin + at, value_column(thread), at < count && (!PREFIX || begin + at < keys.length));
+      for (int i = 0; i < LOGIT_STEPS; ++i)
+        first.keys[n][i] =
+            keys.load(begin + key, i * 32 + thread % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
   }
+#pragma unroll
+  for (int n = 0; n < VALUES_AHEAD; ++n)
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      const int at = value_of(thread, group + n * KEY_GROUPS, i);
+      if (PREFIX || (begin + at >= keys.length && at < count))
+        first.values[n][i] =
+            values.load(begin + at, value_column(thread), at < count && (!PREFIX || begin + at < keys.length));
+    }
 }
 
 // The queries of a row tile, to shared memory.
 __device__ __forceinline__ void take_queries(int thread, const Args& args, float* smem, int row_tile) {
+  const int first = row_tile % HEAD_ROW_TILES * 16, of_head = row_tile / HEAD_ROW_TILES * ROWS;
   for (int i = thread; i < 16 * HD / 8; i += THREADS) {
     const int row = i / (HD / 8), at = i % (HD / 8);
     uint4 v = make_uint4(0, 0, 0, 0);
-    if (row_tile * 16 + row < ROWS) v = load_shared_by_grid(args.queries + ((row_tile * 16 + row) * HD + at * 8) * 2);
+    if (first + row < ROWS) v = load_shared_by_grid(args.queries + ((of_head + first + row) * HD + at * 8) * 2);
     *(uint4*)(smem + S_QUERIES + row * QUERIES_ROW + at * 4) = v;
   }
 }
 
-__device__ __forceinline__ void logits(int thread, const Args& args, float* smem, const First& first, const Keys& keys, int begin,
-                                       int count) {
+// The same without a way through shared memory, where each warp has few of them.
+__device__ __forceinline__ void ask_queries(int thread, const Args& args, Queries& queries, int row_tile) {
+  const int row = row_tile % HEAD_ROW_TILES * 16 + thread % 32 / 4;
+  const byte* const from = args.queries + (row_tile / HEAD_ROW_TILES * ROWS + row) * HD * 2 + thread % 4 * 16;
+#pragma unroll
+  for (int i = 0; i < LOGIT_STEPS; ++i) {
+    queries.low[i] = queries.high[i] = make_uint4(0, 0, 0, 0);
+    const bool there = i * 32 + thread % 4 * 8 < HD;
+    if (there && row < ROWS) queries.low[i] = load_shared_by_grid(from + i * 64);
+    if (there && row + 8 < ROWS) queries.high[i] = load_shared_by_grid(from + 8 * HD * 2 + i * 64);
+  }
+}
+
+__device__ __forceinline__ void logits(int thread, const Args& args, float* smem, const First& first, const Queries& asked,
+                                       const Keys& keys, int begin, int count) {
   const int warp = thread / 32, lane = thread % 32, g = lane / 4, t = lane % 4;
   const float* const queries = smem + S_QUERIES + g * QUERIES_ROW + t * 4;
   auto multiply = [&](int tile, const uint4(&k)[LOGIT_STEPS]) {
@@ -60,7 +84,9 @@ __device__ __forceinline__ void logits(int thread, const Args& args, float* smem
 #pragma unroll
     for (int i = 0; i < LOGIT_STEPS; ++i) {
       uint4 low = make_uint4(0, 0, 0, 0), high = low;
-      if (i * 32 + t * 8 < HD) {
+      if (ALL_AHEAD) {
+        low = asked.low[i], high = asked.high[i];
+      } else if (i * 32 + t * 8 < HD) {
         low = *(const uint4*)(queries + i * 16), high = *(const uint4*)(queries + i * 16 + 8 * QUERIES_ROW);
       }
       mma(c, low.x, high.x, low.y, high.y, k[i].x, k[i].y);
@@ -71,7 +97,10 @@ __device__ __forceinline__ void logits(int thread, const Args& args, float* smem
     *(float2*)to = make_float2(c[0] * by, c[1] * by);
     *(float2*)(to + 8 * LOGITS_ROW) = make_float2(c[2] * by, c[3] * by);
   };
-  if (warp * 8 < count) multiply(warp, first.keys);
+#pragma unroll
+  for (int n = 0; n < KEYS_AHEAD; ++n)
+    if ((warp + n * WARPS) * 8 < count) multiply(warp + n * WARPS, first.keys[n]);
+  if (ALL_AHEAD) return;
 #pragma unroll 1
   for (int tile = warp + WARPS; tile * 8 < count; tile += WARPS) {
     uint4 k[LOGIT_STEPS];
@@ -82,23 +111,48 @@ __device__ __forceinline__ void logits(int thread, const Args& args, float* smem
   }
 }
 
-// Weights 2^(logit - largest), rounded to bfloat16; largest and sum of a row go to the combination.
-__device__ __forceinline__ void softmax(int thread, const Args& args, float* smem, int share, int count) {
+// Weights 2^(logit - largest), rounded to bfloat16; largest and sum of a row go to the combination, of one share alone the
+// sum to S_RMS. own: how many of the share's keys are before the suffix's first.
+__device__ __forceinline__ void softmax(int thread, const Args& args, float* smem, int share, int count, int own) {
   const int warp = thread / 32, lane = thread % 32;
   for (int row = warp; row < 16; row += WARPS) {
     const float* const from = smem + S_WORK + row * LOGITS_ROW;
     unsigned short* const to = (unsigned short*)(smem + S_WEIGHTS + row * WEIGHTS_ROW);
     float top = -infinity(), sum = 0;
-    for (int key = lane; key < count; key += 32) top = fmaxf(top, from[key]);
+    const int token = (share / SPLITS % HEAD_ROW_TILES * 16 + row) / GROUP;
+    const int seen = CAUSAL ? max(min(count, own + token + 1), 0) : count;
+    if (ALL_AHEAD) {  // a lane's keys at once
+      constexpr int MINE = (SPLIT_KEYS + 31) / 32;
+      float mine[MINE];
+#pragma unroll
+      for (int i = 0; i < MINE; ++i) {
+        mine[i] = i * 32 + lane < seen ? from[i * 32 + lane] : -infinity();
+        top = fmaxf(top, mine[i]);
+      }
+#pragma unroll
+      for (int by = 16; by; by /= 2) top = fmaxf(top, __shfl_xor_sync(~0u, top, by));
+#pragma unroll
+      for (int i = 0; i < MINE; ++i) {
+        const u32 weight = i * 32 + lane < seen ? pack(exp2f(mine[i] - top), 0) : 0;
+        if (i * 32 + lane < SPLIT_KEYS) to[i * 32 + lane] = weight;
+        sum += low_of(weight);
+      }
+    } else {
+    for (int key = lane; key < seen; key += 32) top = fmaxf(top, from[key]);
 #pragma unroll
     for (int by = 16; by; by /= 2) top = fmaxf(top, __shfl_xor_sync(~0u, top, by));
     for (int key = lane; key < (count + 15) / 16 * 16; key += 32) {
-      const u32 weight = key < count ? pack(exp2f(from[key] - top), 0) : 0;
+      const u32 weight = key < seen ? pack(exp2f(from[key] - top), 0) : 0;
       to[key] = weight, sum += low_of(weight);
+    }
     }
 #pragma unroll
     for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
-    if (lane == 0) *(float2*)(args.tops + (share * 16 + row) * 2) = make_float2(top, sum);
+    if (lane > 0) continue;
+    if (COMBINES)
+      *(float2*)(args.tops + (share * 16 + row) * 2) = make_float2(top, sum);
+    else
+      smem[S_RMS + row] = sum;
   }
 }
 
@@ -123,13 +177,15 @@ __device__ __forceinline__ void weigh(int thread, float* smem, const First& firs
     }
   };
   Row rows[4];
-  if (group * 16 < count) {
 #pragma unroll
-    for (int i = 0; i < 4; ++i) rows[i].all = first.values[i];
-    multiply(group, rows);
-  }
+  for (int n = 0; n < VALUES_AHEAD; ++n)
+    if ((group + n * KEY_GROUPS) * 16 < count) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) rows[i].all = first.values[n][i];
+      multiply(group + n * KEY_GROUPS, rows);
+    }
 #pragma unroll(WARPS > 8 ? 1 : 3)
-  for (int step = group + KEY_GROUPS; step * 16 < count; step += KEY_GROUPS) {
+  for (int step = group + KEY_GROUPS; !ALL_AHEAD && step * 16 < count; step += KEY_GROUPS) {
 #pragma unroll
     for (int i = 0; i < 4; ++i) rows[i].all = values.load(begin + value_of(thread, step, i), value_column(thread), value_of(thread, step, i) < count);
     multiply(step, rows);
@@ -145,11 +201,19 @@ __device__ __forceinline__ void weigh(int thread, float* smem, const First& firs
   }
 }
 
-__device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem, int layer, int length) {
+// attended_times: where a row has one share, it leaves as `combine` would have it leave.
+__device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem, int layer, int length, float attended_times) {
   int thread = thread_of_phase();
-  const Keys keys{args.cache_k + layer * args.layer_stride, args.keys, length};
-  const Keys values{args.cache_v + layer * args.layer_stride, args.values, length};
-  const int total = length + T, share_keys = ((total + 7) / 8 + SPLITS - 1) / SPLITS * 8;
+  Keys keys{args.cache_k + layer * args.layer_stride, args.keys, length};
+  Keys values{args.cache_v + layer * args.layer_stride, args.values, length};
+  const int total = is_self(layer) ? length + T : length, share_keys = ((total + 7) / 8 + SPLITS - 1) / SPLITS * 8;
+  auto take_head = [&](int share) {  // whose keys and values a share has
+    if (KV_HEADS == 1) return;
+    const int head = min(share / SPLITS / HEAD_ROW_TILES, KV_HEADS - 1);
+    const long long at = layer * args.layer_stride + head * HEAD_STRIDE;
+    keys.prefix = args.cache_k + at, values.prefix = args.cache_v + at;
+    keys.suffix = args.keys + head * T * HD * 2, values.suffix = args.values + head * T * HD * 2;
+  };
   First first;
   auto begin_of = [&](int share) { return share % SPLITS * share_keys; };
   auto count_of = [&](int share) {
@@ -163,18 +227,27 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
 #endif
   const int block = block_of_phase();
   int share = block;
+  take_head(share);
   ask_first<true>(thread, first, keys, values, begin_of(share), count_of(share));
   grid.wait();
   for (; share < ROW_TILES * SPLITS; share += BLOCKS) {
     if (ROW_TILES * SPLITS > BLOCKS) thread = of_phase(thread);
     const int begin = begin_of(share), count = count_of(share);
-    if (NEXT && share != block) ask_first<true>(thread, first, keys, values, begin, count);
+    if (NEXT && share != block) {
+      take_head(share);
+      ask_first<true>(thread, first, keys, values, begin, count);
+    }
     ask_first<false>(thread, first, keys, values, begin, count);
-    take_queries(thread, args, smem, share / SPLITS);
+    Queries queries;
+    if (ALL_AHEAD) {
+      ask_queries(thread, args, queries, share / SPLITS);
+    } else {
+      take_queries(thread, args, smem, share / SPLITS);
+      __syncthreads();
+    }
+    logits(thread, args, smem, first, queries, keys, begin, count);
     __syncthreads();
-    logits(thread, args, smem, first, keys, begin, count);
-    __syncthreads();
-    softmax(thread, args, smem, share, count);
+    softmax(thread, args, smem, share, count, length - begin);
     __syncthreads();
     weigh(thread, smem, first, values, begin, count);
     __syncthreads();
@@ -185,7 +258,16 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
         const float4 v = *(const float4*)(smem + S_OUT + (group * 16 + i / (HD / 4)) * OUT_ROW + i % (HD / 4) * 4);
         sum.x += v.x, sum.y += v.y, sum.z += v.z, sum.w += v.w;
       }
-      *(float4*)(args.partial + share * 16 * HD + i * 4) = sum;
+      if (COMBINES) {
+        *(float4*)(args.partial + share * 16 * HD + i * 4) = sum;
+        continue;
+      }
+      const int row = share % HEAD_ROW_TILES * 16 + i / (HD / 4), head = share / HEAD_ROW_TILES * GROUP + row % GROUP;
+      if (row >= ROWS) continue;
+      const float by = attended_times / smem[S_RMS + i / (HD / 4)];
+      const int column = head * HD + i % (HD / 4) * 4;
+      store_operand(args.attended, row / GROUP, column, sum.x * by, sum.y * by);
+      store_operand(args.attended, row / GROUP, column + 2, sum.z * by, sum.w * by);
     }
     if (!NEXT) break;
     __syncthreads();  // before the next share takes the room
@@ -196,16 +278,16 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
 __device__ __forceinline__ void combine(const Args& args, float attended_times) {
   const int thread = thread_of_phase();
   constexpr int TOGETHER = SPLITS < 16 ? SPLITS : 16;
-  for (int task = thread / 32 * BLOCKS + block_of_phase(); task * 64 < ROWS * HD; task += WARPS * BLOCKS) {
-    const int at = task * 64 + thread % 32 * 2, row = at / HD, column = at % HD;
-    if (at >= ROWS * HD) continue;
+  for (int task = thread / 32 * BLOCKS + block_of_phase(); task * 64 < KV_HEADS * ROWS * HD; task += WARPS * BLOCKS) {
+    const int at = task * 64 + thread % 32 * 2, all = at / HD, column = at % HD, of_head = all / ROWS, row = all % ROWS;
+    if (at >= KV_HEADS * ROWS * HD) continue;
     float top = -infinity(), sum = 0;
     float2 out = make_float2(0, 0);
     for (int first = 0; first < SPLITS; first += TOGETHER) {
       float2 tops[TOGETHER], parts[TOGETHER];
 #pragma unroll
       for (int i = 0; i < TOGETHER; ++i) {
-        const int share = row / 16 * SPLITS + first + i;
+        const int share = (of_head * HEAD_ROW_TILES + row / 16) * SPLITS + first + i;
         tops[i] = make_float2(-infinity(), 0), parts[i] = make_float2(0, 0);
         if (first + i < SPLITS) {
           tops[i] = __ldcg((const float2*)(args.tops + (share * 16 + row % 16) * 2));
@@ -224,6 +306,6 @@ __device__ __forceinline__ void combine(const Args& args, float attended_times) 
       }
     }
     const float by = attended_times / sum;
-    store_operand(args.attended, row / HEADS, row % HEADS * HD + column, out.x * by, out.y * by);
+    store_operand(args.attended, row / GROUP, (of_head * GROUP + row % GROUP) * HD + column, out.x * by, out.y * by);
   }
 }

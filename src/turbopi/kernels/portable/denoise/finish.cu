@@ -19,6 +19,43 @@ __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) 
   }
 }
 
+// The same in front of a product. Of a narrow stream some threads have a token: their loads go in front of the product's, and
+// few sums cross lanes.
+struct InverseRms {
+  static constexpr bool NARROW = !MODULATED && D_TILES % 2 == 0;
+  static constexpr int SHARING = THREADS >= 512 ? 8 : THREADS >= 256 ? 4 : 2;  // threads of a token
+  static constexpr int LOADS = NARROW ? (D_TILES / 2 + SHARING - 1) / SHARING : 1;
+  const Args& args;
+  float* smem;
+  float2 of[LOADS];
+  __device__ __forceinline__ void ask(int thread) {
+    if (!NARROW) return;
+    const int token = thread / SHARING, mine = thread % SHARING;
+#pragma unroll
+    for (int i = 0; i < LOADS; ++i) {
+      of[i] = make_float2(0, 0);
+      if (token < T && (i * SHARING + mine) * 2 < D_TILES)
+        of[i] = __ldcg((const float2*)(args.squares + token * D_TILES) + i * SHARING + mine);
+    }
+  }
+  __device__ __forceinline__ void make(int thread) {
+    if (!NARROW) {
+      make_inverse_rms(args, smem);
+      return;
+    }
+    float sum = 0;
+#pragma unroll
+    for (int i = 0; i < LOADS; ++i) sum += of[i].x + of[i].y;
+#pragma unroll
+    for (int by = SHARING / 2; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
+    if (thread / SHARING < T && thread % SHARING == 0) smem[S_RMS + thread / SHARING] = rsqrtf(sum / D + args.eps);
+  }
+};
+struct Nothing {
+  __device__ __forceinline__ void ask(int) const {}
+  __device__ __forceinline__ void make(int) const {}
+};
+
 // Sums of the stream behind a norm: times 1 / rms (of eight bits, and the channel's scale), plus the shift's product.
 struct Normed {
   const float *shifted, *scales;  // of the product's first channel
@@ -28,7 +65,7 @@ struct Normed {
   };
   __device__ __forceinline__ Factors of(Item i) const {
     Factors f{make_float2(0, 0), make_float2(1, 1)};
-    if (i.valid) f.shift = two(shifted + i.tile * 8 + i.pair * 2);
+    if (MODULATED && i.valid) f.shift = two(shifted + i.tile * 8 + i.pair * 2);
     if (SCALED && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
     return f;
   }
@@ -50,7 +87,7 @@ struct FinishQkv {
   };
   __device__ __forceinline__ Factors factors(Item i) const {
     Factors f{normed.of(i), make_float2(1, 0)};
-    if (i.valid && i.tile < (HEADS + 1) * HEAD_TILES)
+    if (i.valid && i.tile < (HEADS + KV_HEADS) * HEAD_TILES)
       f.rope = __ldg(rope + i.token * (HD / 2) + i.tile % HEAD_TILES * 4 + i.pair);
     return f;
   }
@@ -58,16 +95,20 @@ struct FinishQkv {
     if (!i.valid) return;
     const float2 v = normed.apply(i, f.normed, sum);
     const int head = i.tile / HEAD_TILES;
-    if (head == HEADS + 1) {
-      *(u32*)(values + i.token * HD + i.tile % HEAD_TILES * 8 + i.pair * 2) = pack(v.x, v.y);
+    if (head >= HEADS + KV_HEADS) {
+      const int row = (head - HEADS - KV_HEADS) * T + i.token;
+      *(u32*)(values + row * HD + i.tile % HEAD_TILES * 8 + i.pair * 2) = pack(v.x, v.y);
       return;
     }
     const u32 both = pack(v.x * f.rope.x - v.y * f.rope.y, v.y * f.rope.x + v.x * f.rope.y);
     unsigned short* const to =
-        (head < HEADS ? queries + (i.token * HEADS + head) * HD : keys + i.token * HD) + i.tile % HEAD_TILES * 4 + i.pair;
+        (head < HEADS ? queries + (head / GROUP * ROWS + i.token * GROUP + head % GROUP) * HD : keys + ((head - HEADS) * T + i.token) * HD) +
+        i.tile % HEAD_TILES * 4 + i.pair;
     to[0] = both, to[HD / 2] = both >> 16;
   }
 };
+
+__device__ __forceinline__ float silu(float v) { return __fdividef(v, 1 + exp2f(v * -1.4426950408889634f)); }
 
 // gate|up: of a pair the first is a unit's gate, the second its up.
 struct FinishGateUp {
@@ -79,8 +120,12 @@ struct FinishGateUp {
     float unit = 0;
     if (i.valid) {
       const float2 v = normed.apply(i, f, sum);
+#if TP_SILU
+      unit = silu(v.x) * v.y;
+#else
       const float inner = 0.7978845608028654f * (v.x + 0.044715f * v.x * v.x * v.x);
       unit = __fdividef(v.x, 1 + exp2f(inner * (-2 * 1.4426950408889634f))) * v.y;  // GELU by tanh, times up
+#endif
     }
     const float next = __shfl_xor_sync(~0u, unit, 1);
     if (i.valid && i.pair % 2 == 0) store_operand(hidden, i.token, i.tile * 4 + i.pair, unit, next);
@@ -122,5 +167,22 @@ struct FinishResidual {
   }
   __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
     into.keep(i, make_float2(f.x.x + sum.x * f.gate.x, f.x.y + sum.y * f.gate.y), f.scale);
+  }
+};
+
+// The mixed tokens: the MLP's last product and its bias, the stream of the first norm.
+struct FinishMixed {
+  Stream into;
+  const float* bias;
+  struct Factors {
+    float2 bias, scale;
+  };
+  __device__ __forceinline__ Factors factors(Item i) const {
+    Factors f{};
+    if (i.valid) f.bias = two(bias + i.tile * 8 + i.pair * 2), f.scale = two(into.scale + i.tile * 8 + i.pair * 2);
+    return f;
+  }
+  __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
+    into.keep(i, make_float2(f.bias.x + sum.x, f.bias.y + sum.y), f.scale);
   }
 };

@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.config import ModelConfig
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel
+from turbopi.kernels.portable.denoise.packing import Expert
 from turbopi.support.errors import BackendError, BackendUnavailable
 
 
@@ -36,7 +36,7 @@ OF_LAUNCH = (
 )
 
 
-def model_sizes(config: ModelConfig, suffix: int) -> dict[str, int]:
+def model_sizes(config: Expert, suffix: int) -> dict[str, int]:
     """The compile-time constants that both kernels have."""
     g = config.expert
     return {
@@ -62,7 +62,7 @@ def affine(small: State, name: str, x: Tensor) -> Tensor:
     return F.linear(x, small[f"{name}.weight"].to(x.dtype), small[f"{name}.bias"].to(x.dtype))
 
 
-def end_tensors(config: ModelConfig, small: State, table: Tensor, *, out_w: Tensor, in_w: Tensor) -> dict[str, Tensor]:
+def end_tensors(config: Expert, small: State, table: Tensor, *, out_w: Tensor, in_w: Tensor) -> dict[str, Tensor]:
     """What the fields of `ends` point to, but for the cache; `table` float32[N, 2L + 1, 3, D] on the device."""
     exponents = torch.arange(0, config.expert.head_dim, 2, dtype=torch.float32, device=table.device)
     return {
@@ -94,7 +94,7 @@ class CooperativeDenoiser:
 
     def __init__(
         self,
-        config: ModelConfig,
+        config: Expert,
         *,
         steps: int,
         suffix: int,
@@ -120,8 +120,9 @@ class CooperativeDenoiser:
     ) -> None:
         """Denoise on the current stream.
 
-        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
-        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A]. `tokens`: by token.
+        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], of several heads [L, G, rows, K], the first
+        `length` (int64[1], on the device) rows valid and the others never read; written: x_t float32[N + 1, T, A],
+        v_t float32[N, T, A]. `tokens`: by token.
         """
         assert length.dtype == torch.int64, length.dtype
         self._launch(noise, cache_k, cache_v, x_t, v_t, length=length, **self._token_tensors(tokens))
@@ -136,7 +137,7 @@ class CooperativeDenoiser:
         chunk = self._suffix, self._config.action_dim
         assert noise.shape == chunk and x_t.shape == (self._steps + 1, *chunk) and v_t.shape == (self._steps, *chunk)
         head_dim = self._config.expert.head_dim
-        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (head_dim, 1), cache_k.stride()
+        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[-2:] == (head_dim, 1), cache_k.stride()
         assert cache_k.dtype == cache_v.dtype == torch.bfloat16
         assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
         given = {**self._tensors, "noise": noise, "cache_k": cache_k, "cache_v": cache_v, "x_t": x_t, "v_t": v_t}

@@ -3,9 +3,9 @@
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -25,13 +25,53 @@ WeightNumbers = Literal["bf16", "fp8", "int8"]
 KINDS = sites.KINDS["expert"]  # a layer's matrices, in the order in which they are read
 
 
+class Expert(Protocol):
+    """What the kernel asks about a model: `ModelConfig` of Pi0.5, or another family's sizes."""
+
+    @property
+    def expert(self) -> GemmaConfig: ...
+    @property
+    def action_dim(self) -> int: ...
+    @property
+    def rms_norm_eps(self) -> float: ...
+    @property
+    def rope_base(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Form:
+    """What an expert does otherwise than Pi0.5's, for which the defaults stand.
+
+    modulated   each step has norms' weights of its own; else the time is mixed into the tokens, by an MLP
+    self_every  so many-th layers attend to prefix and suffix, the others to the prefix alone, through keys and values
+                of their own and with tokens counted from 0; 0: all others
+    causal      a token of the suffix doesn't see those behind it
+    silu        SwiGLU, not GeGLU
+    """
+
+    modulated: bool = True
+    self_every: int = 1
+    causal: bool = False
+    silu: bool = False
+
+    def is_self(self, layer: int) -> bool:
+        return self.self_every > 0 and layer % self.self_every == 0
+
+
+PI05 = Form()
+
+
 def refusal(config: ModelConfig) -> str | None:
-    """Why the kernel can't run this model, or None if it can."""
+    """Why the kernel can't run this model of Pi0's kind, or None if it can."""
     g = config.expert
     if not family_of(config).modulated or family_of(config).state_token:
         return f"it covers Pi0.5, this model is {config.kind}"
     if g.num_kv_heads != 1:
         return f"it needs one key/value head, this model has {g.num_kv_heads}"
+    return refusal_of_sizes(g)
+
+
+def refusal_of_sizes(g: GemmaConfig) -> str | None:
     if g.width % 16 or g.mlp_dim % 16:
         return f"widths must be multiples of 16: width {g.width}, mlp_dim {g.mlp_dim}"
     if g.head_dim % 16 or g.head_dim > 256:
@@ -42,15 +82,21 @@ def refusal(config: ModelConfig) -> str | None:
 def matrix_shapes(g: GemmaConfig) -> list[tuple[int, int]]:
     """(rows, columns) of a layer's qkv, out, gate|up and down."""
     heads = g.num_heads * g.head_dim
-    return [(heads + 2 * g.head_dim, g.width), (g.width, heads), (2 * g.mlp_dim, g.width), (g.width, g.mlp_dim)]
+    return [
+        (heads + 2 * g.num_kv_heads * g.head_dim, g.width),
+        (g.width, heads),
+        (2 * g.mlp_dim, g.width),
+        (g.width, g.mlp_dim),
+    ]
 
 
 def qkv_rows(g: GemmaConfig) -> Tensor:
     """int64[rows]: which row of q|k|v each channel is. Of queries and keys RoPE's partners are neighbours."""
     half = g.head_dim // 2
     paired = torch.arange(g.head_dim).view(2, half).T.flatten()
-    heads = [head * g.head_dim + paired for head in range(g.num_heads + 1)]
-    return torch.cat([*heads, (g.num_heads + 1) * g.head_dim + torch.arange(g.head_dim)])
+    turned = g.num_heads + g.num_kv_heads
+    heads = [head * g.head_dim + paired for head in range(turned)]
+    return torch.cat([*heads, turned * g.head_dim + torch.arange(g.num_kv_heads * g.head_dim)])
 
 
 def gate_up_rows(g: GemmaConfig) -> Tensor:
@@ -83,22 +129,24 @@ def tiles(matrix: Tensor) -> Tensor:
 class PackedExpert:
     """The expert's matrices in the kernel's order. One serves kernels of any number of steps, tokens and blocks."""
 
-    config: ModelConfig
+    config: Expert
     weights: Tensor  # bfloat16, e4m3 or int8[L, elements]: of a layer qkv, out, gate|up, down
     scales: (
         Tensor  # float32[L, rows of qkv, out, gate|up, down] of weights of eight bits, in the matrices' order; [L, 0]
     )
     inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights, 1 of int8's; [L, 0] of others
+    form: Form = PI05
 
     @classmethod
     def pack(
         cls,
-        config: ModelConfig,
-        layers: list[GemmaLayer],
+        config: Expert,
+        layers: Sequence[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
         format: Format = FP8,
         device: torch.device | None = None,
+        form: Form = PI05,
     ) -> "PackedExpert":
         """`inputs`: the activations' scales by site (1 for INT8, which leaves them in bfloat16), and weights become
         numbers of the format with a scale for each output channel, rounded for `directions` by site. The layers come
@@ -106,7 +154,7 @@ class PackedExpert:
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
-        reason = refusal(config)
+        reason = refusal(config) if isinstance(config, ModelConfig) else refusal_of_sizes(config.expert)
         if reason is not None:
             raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
         scales, of_inputs = [], []
@@ -133,6 +181,7 @@ class PackedExpert:
             weights if inputs is None else weights.view(format.dtype),
             torch.stack(scales) if scales else none,
             torch.tensor(of_inputs, dtype=torch.float32, device=weights.device) if of_inputs else none,
+            form,
         )
 
     @property
@@ -177,7 +226,7 @@ def _orders(g: GemmaConfig) -> tuple[Tensor | None, ...]:
 class Tables:
     """What the kernel needs beside the weights. Scales of eight bits are in it, so that the kernel applies few."""
 
-    modulation: Tensor  # float32[N, 2L + 1, 3, D]
+    modulation: Tensor  # float32[N, 2L + 1, 3, D]; N is 1 where a step has none of its own
     shifted: Tensor  # float32[N, L, channels of qkv, gate|up]: what the norms' shifts add to the products behind them
     row_scales: Tensor  # float32[L, channels of qkv, gate|up]; [L, 0] of bfloat16
     attended_times: Tensor  # float32[L]: 1 / scale of attention's outputs; empty of bfloat16

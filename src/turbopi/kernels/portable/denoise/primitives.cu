@@ -58,10 +58,14 @@ struct Grid {
   // Cycles of thread 0: [block][phase][working, at the barrier behind it]; phases are PHASES of kernel.py.
   __device__ __forceinline__ void note(int waited) {
     if (threadIdx.x > 0) return;
-    const int before = expected / BLOCKS % (6 * L + 2) - waited, barrier = before < 0 ? 6 * L + 1 : before;
-    const int phase = barrier == 0 ? 6 : barrier == 6 * L + 1 ? 7 : (barrier - 1) % 6;
+    const int before = expected / BLOCKS % STEP_PHASES - waited, barrier = before < 0 ? STEP_PHASES - 1 : before;
+    const int of_layer = (barrier - FIRST_PHASES) % LAYER_PHASES;
+    const int phase = barrier == 0                ? 6
+                      : barrier < FIRST_PHASES    ? 8
+                      : barrier == STEP_PHASES - 1 ? 7
+                                                   : of_layer + (!COMBINES && of_layer > 1);
     const long long now = clock64();
-    trace[(blockIdx.x * 8 + phase) * 2 + waited] += now - last, last = now;
+    trace[(blockIdx.x * 9 + phase) * 2 + waited] += now - last, last = now;
   }
 };
 

@@ -15,8 +15,8 @@ struct Item {
 
 // Tiles are shared out evenly: a block's first one.
 template <class S>
-__device__ __forceinline__ int first_tile(int block) {
-  return (long long)S::TILES * block / BLOCKS;
+__device__ __forceinline__ int first_tile(int block, int tiles = S::TILES) {
+  return (long long)tiles * block / BLOCKS;
 }
 
 template <class S>
@@ -26,10 +26,11 @@ struct Product {
   int first, end;  // tiles
   uint4 w[S::IN_FLIGHT];
 
-  __device__ __forceinline__ explicit Product(const byte* all) : thread(thread_of_phase()) {
+  // tiles: the first ones alone
+  __device__ __forceinline__ explicit Product(const byte* all, int tiles = S::TILES) : thread(thread_of_phase()) {
     weights = all + thread % 32 * 16;
     const int block = block_of_phase();
-    first = first_tile<S>(block), end = first_tile<S>(block + 1);
+    first = first_tile<S>(block, tiles), end = first_tile<S>(block + 1, tiles);
   }
   __device__ __forceinline__ int first_chunk() const { return thread / 32 / S::WN * S::WARP_CHUNKS; }
   // Load number n of a lane, counted over all passes.
@@ -67,13 +68,15 @@ struct Product {
     return i;
   }
 
-  // `meanwhile` is done while the first activations are on their way.
+  // `meanwhile` is made while the first activations are on their way; what it needs is asked for in front of them.
   template <class Finish, class Meanwhile>
-  __device__ __forceinline__ void run(Grid& grid, float* smem, const byte* activation, Finish& finish, Meanwhile meanwhile) {
+  __device__ __forceinline__ void run(Grid& grid, float* smem, const byte* activation, Finish& finish, Meanwhile& meanwhile) {
     const int warp = thread / 32, lane = thread % 32;
     Item mine = item(0, thread);
     auto factors = finish.factors(mine);
     grid.wait();
+    if (S::TILES < BLOCKS && first == end) return;  // it would load all activations for nothing
+    meanwhile.ask(thread);
     uint4 a[S::A_IN_FLIGHT][GROUPS][PIECES];
     for (int pass = 0; pass < S::PASSES; ++pass) {
       if (S::PASSES > 1) thread = of_phase(thread), first = of_phase(first), end = of_phase(end);
@@ -81,7 +84,7 @@ struct Product {
 #pragma unroll
         for (int chunk = 0; chunk < S::A_IN_FLIGHT; ++chunk) load_chunk(a[chunk], activation, chunk);
       }
-      if (pass == 0) meanwhile();
+      if (pass == 0) meanwhile.make(thread);
       float c[S::WARP_TILES][M_TILES][4] = {};
 #pragma unroll
       for (int chunk = 0; chunk < S::WARP_CHUNKS; ++chunk) {

@@ -1,16 +1,18 @@
-// The denoising loop of Pi0.5's action expert in one cooperative kernel, for compute capability 8.0 and newer.
+// The denoising loop of an action expert in one cooperative kernel, for compute capability 8.0 and newer: Pi0.5's, and
+// SmolVLA's, whose differences are constants (`Form` in packing.py).
 //
 // Every step reads all weights once and does little else, so the plan is about two things: weights that are on their way
 // all the time, and few, short phases. A phase ends with a barrier of the whole grid; a layer has six:
 //
-//   q|k|v      stream x weights, 1 / rms, shift, RoPE             -> queries, keys, values
+//   q|k|v      stream x weights, 1 / rms, shift, RoPE             -> queries, keys, values; queries alone of a layer across
 //   attention  a block: 16 query rows and a share of the keys     -> partial outputs, largest logits, sums
-//   combine    all shares of a row                                -> attended
+//   combine    all shares of a row                                -> attended; where there are several shares
 //   out        attended x weights, gate, residual                 -> x, and the stream of the next norm
-//   gate|up    stream x weights, 1 / rms, shift, GeGLU            -> hidden
+//   gate|up    stream x weights, 1 / rms, shift, GeGLU or SwiGLU  -> hidden
 //   down       hidden x weights, gate, residual                   -> x, and the stream of the next norm
 //
-// A step adds one phase in front (action_in_proj) and one behind (final norm, action_out_proj, Euler step).
+// A step adds one phase in front (action_in_proj; where the time is mixed into the tokens, the hidden units of that MLP and
+// a product behind them) and one behind (final norm, action_out_proj, Euler step).
 //
 // x is float32. The stream is x times the next norm's scale, rounded to OPERAND; 1 / rms is multiplied in behind the
 // product, and the norm's shift comes as a table that is already multiplied with the weights, `shifted`.
@@ -29,6 +31,11 @@ using u64 = unsigned long long;
 
 constexpr int D = TP_WIDTH, F = TP_MLP_DIM, L = TP_DEPTH, HEADS = TP_HEADS, HD = TP_HEAD_DIM;
 constexpr int T = TP_TOKENS, A = TP_ACTION_DIM;
+constexpr int KV_HEADS = TP_KV_HEADS, GROUP = HEADS / KV_HEADS;  // of query heads, which share keys and values
+constexpr int SELF_EVERY = TP_SELF_EVERY;  // so many-th layers attend to the suffix, too; the others to the prefix alone
+constexpr bool ACROSS = SELF_EVERY != 1;   // whether there are such others
+constexpr bool CAUSAL = TP_CAUSAL;         // a token of the suffix sees those before it and itself
+constexpr bool MODULATED = TP_MODULATED;   // a step has norms' weights of its own; else the time is mixed into the tokens
 constexpr int BLOCKS = TP_BLOCKS, WARPS = TP_WARPS, THREADS = WARPS * 32;
 constexpr u32 LOOKS = TP_LOOKS;
 constexpr bool FP8 = TP_FP8, INT8 = TP_INT8;  // INT8: weights alone, which become bfloat16 in registers, exactly
@@ -39,11 +46,15 @@ constexpr int PIECES = OPERAND_BYTES / WEIGHT_BYTES;     // of 64 bytes: a token
 constexpr int CHUNK_BYTES = 512;           // of a tile
 constexpr int GROUPS = (T + 7) / 8;        // of 8 tokens
 constexpr int M_TILES = (T + 15) / 16;
-constexpr int ROWS = T * HEADS;  // of queries, row = token * HEADS + head
-constexpr int ROW_TILES = (ROWS + 15) / 16;
+constexpr int ROWS = T * GROUP;  // of the queries of a key/value head, row = token * GROUP + head in the group
+constexpr int HEAD_ROW_TILES = (ROWS + 15) / 16, ROW_TILES = KV_HEADS * HEAD_ROW_TILES;
 constexpr int SPLITS = TP_SPLITS;  // shares of the keys
 constexpr int SPLIT_KEYS = TP_SPLIT_KEYS;
-constexpr int QKV_ROWS = (HEADS + 2) * HD;
+constexpr bool COMBINES = SPLITS > 1;
+constexpr int QKV_ROWS = (HEADS + 2 * KV_HEADS) * HD;
+constexpr long long HEAD_STRIDE = KV_HEADS > 1 ? TP_CACHE_ROWS * HD * 2ll : 0;  // bytes of the cache, from head to head
+constexpr int LAYER_PHASES = COMBINES ? 6 : 5, FIRST_PHASES = MODULATED ? 1 : 2, STEP_PHASES = LAYER_PHASES * L + FIRST_PHASES + 1;
+__device__ __forceinline__ bool is_self(int layer) { return !ACROSS || (SELF_EVERY > 0 && layer % SELF_EVERY == 0); }
 
 constexpr __host__ __device__ int divisor(int of, int limit) {  // the largest one up to the limit
   int found = 1;
@@ -78,13 +89,18 @@ using QkvShape = Shape<QKV_ROWS, D>;
 using OutShape = Shape<D, HEADS * HD>;
 using GateUpShape = Shape<2 * F, D>;
 using DownShape = Shape<D, F>;
+using MixShape = Shape<D, D>;
 constexpr long long QKV_AT = 0, OUT_AT = QkvShape::BYTES, GATE_UP_AT = OUT_AT + OutShape::BYTES;
 constexpr long long DOWN_AT = GATE_UP_AT + GateUpShape::BYTES, LAYER_BYTES = DOWN_AT + DownShape::BYTES;
 constexpr int D_TILES = D / 8;
 
 // Shared memory, words. Sums of products and what attention keeps take turns.
 constexpr int DIM_GROUPS = (HD + 63) / 64;        // of 64 columns: what a warp weighs of values
-constexpr int KEY_GROUPS = WARPS / DIM_GROUPS;    // of warps, which share out the keys
+constexpr int KEY_GROUPS = WARPS / DIM_GROUPS < 8 ? WARPS / DIM_GROUPS : 8;  // of warps, which share out the keys
+// What a warp has on its way of keys and values before the barrier: its first, or of heads of few columns all of them.
+constexpr bool ALL_AHEAD = HD <= 64;
+constexpr int KEYS_AHEAD = ALL_AHEAD ? (SPLIT_KEYS / 8 + WARPS - 1) / WARPS : 1;
+constexpr int VALUES_AHEAD = ALL_AHEAD ? (SPLIT_KEYS / 16 + KEY_GROUPS - 1) / KEY_GROUPS : 1;
 constexpr int LOGITS_ROW = SPLIT_KEYS + 4, WEIGHTS_ROW = SPLIT_KEYS / 2 + 4, OUT_ROW = HD + 4;
 constexpr int S_RMS = 0, S_WORK = 64;
 constexpr int S_WEIGHTS = S_WORK + 16 * LOGITS_ROW, S_OUT = S_WEIGHTS + 16 * WEIGHTS_ROW;
@@ -92,6 +108,6 @@ constexpr int QUERIES_ROW = HD / 2 + 16;  // two rows in different banks
 constexpr int S_QUERIES = S_OUT + KEY_GROUPS * 16 * OUT_ROW, ATTENTION_END = S_QUERIES + 16 * QUERIES_ROW;
 constexpr __host__ __device__ int larger(int a, int b) { return a > b ? a : b; }
 constexpr int PRODUCTS_END = S_WORK + larger(larger(QkvShape::SUM_WORDS, OutShape::SUM_WORDS),
-                                             larger(GateUpShape::SUM_WORDS, DownShape::SUM_WORDS));
+                                             larger(GateUpShape::SUM_WORDS, DownShape::SUM_WORDS));  // MixShape's are DownShape's at most
 static_assert(larger(ATTENTION_END, PRODUCTS_END) * 4 <= TP_SHARED_BYTES, "too little shared memory");
 static_assert(T <= 64 && WARPS >= DIM_GROUPS && WARPS % 4 == 0, "sizes");

@@ -1,0 +1,282 @@
+"""SmolVLA's plan: vision by the engine's layers, the text layers in merged matrices, the whole denoising loop in the
+portable kernel. What a CUDA graph captures: shapes are static, and nothing is copied to the host.
+
+A prefix is compact: images, the prompt's tokens, the state, then padding; `length`, in device memory, says where that
+begins.
+
+Shapes: S places of a prefix with its padding, L layers of the expert, D its width, A action_dim, N steps, G key heads,
+K head_dim.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import gcd
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.config import GemmaConfig
+from turbopi.engine.forward import HEAD_LAYERS, VisionByOps
+from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, VisionStream
+from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
+from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
+from turbopi.kernels.portable.grouped import grouped_attention, rope_grouped, swiglu
+from turbopi.models.pi0.denoise import time_grid
+from turbopi.models.pi0.layers import rope_tables
+from turbopi.models.pi0.vision import EncoderLayer, normalize_images
+from turbopi.models.smolvla.config import ROPE_BASE, SmolVLAConfig
+from turbopi.models.smolvla.reference import Layer, SmolVLAModel, pixel_shuffle
+
+
+def refusal(config: SmolVLAConfig) -> str | None:
+    """Why the kernels can't run this network, or None if they can."""
+    if config.text.head_dim < 16 or config.vision.head_dim < 16:
+        return "heads are narrower than a tensor core's 16 columns"
+    return refusal_of_sizes(ExpertSizes.of(config).expert)
+
+
+# -- vision -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Vision:
+    """SigLIP and the connector."""
+
+    model: SmolVLAModel
+    ops: Ops
+    layers: list[VisionLayer]
+    patch: Affine
+    norm: Affine
+    projector: Tensor
+
+    @classmethod
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Vision":
+        vision = model.vision
+        weight, bias = _affine(vision.patch_embedding, dtype)
+        layers = [_vision_layer(layer, dtype) for layer in vision.layers]  # type: ignore[arg-type]
+        norm = _affine(vision.post_layernorm, dtype)
+        return cls(model, ops, layers, (weight.flatten(1), bias), norm, model.projector.weight.to(dtype))
+
+    def __call__(self, images: Tensor, head_ends: Callable[[], None] = lambda: None) -> Tensor:
+        """float32[V, h, w, 3] in [-1, 1] -> [V, T, D of the text layers], unscaled. head_ends: `engine.graph.HEAD`."""
+        config, ops, (count, height) = self.model.config, self.ops, images.shape[:2]
+        vision, by_layer = config.vision, ops.vision or VisionByOps(ops)
+        heads, eps = vision.num_heads, vision.layer_norm_eps
+        stream = VisionStream(self._embed(images).flatten(0, 1))
+        matrices = [*(layer.qkv[0] for layer in self.layers[1:]), self.projector]
+        for number, (layer, behind) in enumerate(zip(self.layers, matrices, strict=True)):
+            if number == HEAD_LAYERS:
+                head_ends()
+            stream = by_layer.layer(layer, stream, images=count, heads=heads, eps=eps, following=behind)
+        _, normed = ops.residual_layer_norm(by_layer.finish(stream, self.norm, eps), None, *self.norm, eps)
+        patches = normed.view(count, -1, vision.width)
+        return ops.linear(pixel_shuffle(patches, height // vision.patch_size, config.scale_factor), self.projector)
+
+    def _embed(self, images: Tensor) -> Tensor:
+        """[V, patches, W]"""
+        p, (count, height, width) = self.model.config.vision.patch_size, images.shape[:3]
+        rows, columns = height // p, width // p
+        pixels = normalize_images(images).to(self.projector.dtype).view(count, rows, p, columns, p, 3)
+        patches = pixels.permute(0, 1, 3, 5, 2, 4).reshape(count, rows * columns, 3 * p * p)
+        return F.linear(patches, *self.patch) + self.model.vision.positions(rows, columns).to(pixels.dtype)
+
+
+def _affine(module: Any, dtype: torch.dtype) -> Affine:
+    return module.weight.to(dtype), module.bias.to(dtype)
+
+
+def _vision_layer(layer: EncoderLayer, dtype: torch.dtype) -> VisionLayer:
+    attention, mlp = layer.self_attn, layer.mlp
+    joined = [_affine(one, dtype) for one in (attention.q_proj, attention.k_proj, attention.v_proj)]
+    return VisionLayer(
+        norm1=_affine(layer.layer_norm1, dtype),
+        qkv=(torch.cat([weight for weight, _ in joined]), torch.cat([bias for _, bias in joined])),
+        out=_affine(attention.out_proj, dtype),
+        norm2=_affine(layer.layer_norm2, dtype),
+        fc1=_affine(mlp.fc1, dtype),
+        fc2=_affine(mlp.fc2, dtype),
+    )
+
+
+# -- prefix -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """The text layers, and what the expert's layers across make of their keys and values.
+
+    cross_k, cross_v  [layers across, G K, G K]
+    """
+
+    model: SmolVLAModel
+    ops: Ops
+    layers: list[GemmaLayer[Tensor]]
+    cross_k: Tensor | None
+    cross_v: Tensor | None
+    special: tuple[Tensor, Tensor]  # embeddings around each image, [start or end tokens, D]
+    scale: float  # of images' embeddings
+
+    @classmethod
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Prefix":
+        config, embed = model.config, model.vlm.embed_tokens
+        beside = zip(config.expert_at, model.expert.layers, strict=True)
+        across = [layer.self_attn for at, layer in beside if not config.is_self_layer(at)]
+        cross_k, cross_v = (
+            torch.stack([getattr(one, name).weight.to(dtype).T for one in across]) if across else None
+            for name in ("k_proj", "v_proj")
+        )
+        start, end = (
+            embed(torch.tensor(ids, dtype=torch.int64, device=model.device)).to(dtype)
+            for ids in (config.image_start, config.image_end)
+        )
+        scale = float(torch.tensor(config.text.width**0.5, dtype=dtype))  # rounded, as LeRobot's is
+        layers = [_joined(layer, dtype) for layer in model.vlm.layers]
+        return cls(model, ops, layers, cross_k, cross_v, (start, end), scale)
+
+    def places(self, cameras: int) -> int:
+        """S for so many cameras."""
+        return self.before_prompt(cameras) + self.model.config.max_prompt_tokens + 1
+
+    def before_prompt(self, cameras: int) -> int:
+        config = self.model.config
+        image = (config.image_size // config.vision.patch_size // config.scale_factor) ** 2
+        return cameras * (image + sum(map(len, self.special)))
+
+    def embed(self, images: Tensor, tokens: Tensor, state: Tensor, length: Tensor) -> Tensor:
+        """[S, D] of image embeddings [V, T, D], tokens int64[max_prompt_tokens], whatever they are behind the prompt's
+        end, and state float32[1, A]. length int64[1]: of the prefix, with the state.
+        """
+        model, (start, end) = self.model, self.special
+        parts = [part for image in images.unbind(0) for part in (start, image * self.scale, end)]
+        prompt = model.vlm.embed_tokens(tokens) * model.config.text.width**0.5
+        of_state = model.state_proj(state).to(images.dtype)
+        return torch.cat((*parts, prompt.to(images.dtype), of_state)).index_copy_(0, length - 1, of_state)
+
+    def keys_values(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        """Each text layer's keys, rotated, and values, [layer, G, S, K], of embeddings [S, D]."""
+        text, ops = self.model.config.text, self.ops
+        positions = torch.arange(len(x), device=x.device)[None]
+        cos, sin = (table[0, 0] for table in rope_tables(positions, text.head_dim, ROPE_BASE))
+        k = x.new_empty(text.depth, text.num_kv_heads, len(x), text.head_dim)
+        v, y, eps = torch.empty_like(k), None, text.rms_norm_eps
+        for i, layer in enumerate(self.layers):
+            x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps)
+            last = i + 1 == len(self.layers)  # its keys and values alone are read
+            matrix = layer.qkv[-2 * text.num_kv_heads * text.head_dim :] if last else layer.qkv
+            q = rope_grouped(ops.linear(normed, matrix), cos, sin, k[i], v[i])
+            if not last:
+                y = ops.residual_linear(grouped_attention(q, k[i], v[i], length), layer.out)
+                x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps)
+                y = ops.residual_linear(swiglu(ops.linear(normed, layer.gate_up)), layer.down)
+        return k, v
+
+    def of_expert(self, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """What each of the expert's layers attends to of them, [L, G, S, K]."""
+        config = self.model.config
+        k, v = k[:: config.expert_every], v[:: config.expert_every]
+        if self.cross_k is None or self.cross_v is None:
+            return k, v
+        own = [config.is_self_layer(at) for at in config.expert_at]
+        return _crossed(k, self.cross_k, own), _crossed(v, self.cross_v, own)
+
+
+def _crossed(cached: Tensor, matrices: Tensor, own: list[bool]) -> Tensor:
+    across = [i for i, stays in enumerate(own) if not stays]
+    _, groups, places, head_dim = cached.shape
+    rows = torch.stack([cached[i] for i in across]).transpose(1, 2).reshape(len(across), places, groups * head_dim)
+    made = iter((rows @ matrices).view(len(across), places, groups, head_dim).transpose(1, 2).unbind(0))
+    return torch.stack([one if stays else next(made) for one, stays in zip(cached.unbind(0), own, strict=True)])
+
+
+# -- the expert -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ExpertSizes:
+    """Of the expert, as the kernel reads them."""
+
+    expert: GemmaConfig
+    action_dim: int
+    rms_norm_eps: float
+    rope_base: float = ROPE_BASE
+
+    @classmethod
+    def of(cls, config: SmolVLAConfig) -> "ExpertSizes":
+        text = config.text
+        heads = (text.num_heads, text.num_kv_heads, text.head_dim)
+        expert = GemmaConfig(config.expert_width, config.expert_mlp, config.expert_depth, *heads)
+        return cls(expert, config.action_dim, text.rms_norm_eps)
+
+
+def form(config: SmolVLAConfig) -> Form:
+    every = 1 if config.self_every is None else config.self_every
+    self_every = every // gcd(every, config.expert_every) if every else 0
+    return Form(modulated=False, self_every=self_every, causal=True, silu=True)
+
+
+@dataclass(frozen=True)
+class Expert:
+    """The expert's weights for the kernel, of any number of steps.
+
+    table  float32[1, 2L + 1, 3, D]: of each norm its weight, a shift of 0, a gate of 1
+    """
+
+    packed: PackedExpert
+    table: Tensor
+    model: SmolVLAModel
+
+    @classmethod
+    def pack(cls, model: SmolVLAModel) -> "Expert":
+        config, layers = model.config, model.expert.layers
+        norms = [norm for layer in layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
+        scale = torch.stack([norm.weight.float() for norm in (*norms, model.expert.norm)])
+        table = torch.stack((scale, torch.zeros_like(scale), torch.ones_like(scale)), dim=1)[None]
+        packed = PackedExpert.pack(
+            ExpertSizes.of(config), [_joined(layer, torch.bfloat16) for layer in layers], form=form(config)
+        )
+        return cls(packed, table, model)
+
+    def denoiser(
+        self, num_steps: int, *, cache_rows: int, suffix: int, device: torch.device, **launch: Any
+    ) -> PortableDenoiser:
+        """cache_rows: S, of what it attends to. launch: as `PortableDenoiser` takes it."""
+        ends = {"action_in_proj": self.model.action_in_proj, "action_out_proj": self.model.action_out_proj}
+        small = {f"{name}.{part}": getattr(one, part) for name, one in ends.items() for part in ("weight", "bias")}
+        sizes: dict[str, Any] = {"cache_rows": cache_rows, "suffix": suffix, "device": device, **launch}
+        return PortableDenoiser(
+            self.packed.config, self.packed, small, self.table, mixing=self._mixing(num_steps), **sizes
+        )
+
+    def _mixing(self, num_steps: int) -> Mixing:
+        """action_in_proj and the MLP behind it, whose first matrix also meets the time."""
+        model = self.model
+        into, first, last = model.action_in_proj, model.action_time_mlp_in, model.action_time_mlp_out
+        of_actions, of_time = first.weight.double().chunk(2, dim=1)
+        times = model.embed_times(time_grid(num_steps, model.config.time_grid)).to(of_time)
+        bias = of_actions @ into.bias.double() + first.bias.double()
+        return Mixing(
+            (of_actions @ into.weight.double()).float(),
+            (times @ of_time.T + bias).float(),
+            last.weight,
+            last.bias.float(),
+        )
+
+
+def _joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
+    """A layer across has keys and values of its own, made of the prefix's: their rows here are zeros, which are never
+    read.
+    """
+    of, mlp = layer.self_attn, layer.mlp
+    q, k, v = (one.weight.to(dtype) for one in (of.q_proj, of.k_proj, of.v_proj))
+    if k.shape[1] != q.shape[1]:
+        k = v = q.new_zeros(k.shape[0], q.shape[1])
+    return GemmaLayer(
+        torch.cat((q, k, v)),
+        of.o_proj.weight.to(dtype),
+        torch.cat((mlp.gate_proj.weight, mlp.up_proj.weight)).to(dtype),
+        mlp.down_proj.weight.to(dtype),
+        layer.input_layernorm.weight.float(),
+        layer.post_attention_layernorm.weight.float(),
+    )

@@ -1,0 +1,82 @@
+"""SmolVLA's vision and prefix in the engine's form equal the reference's: without a GPU in float32, by Triton's
+interpreter.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import gpu_or_interpreter
+from smolvla_golden import relative
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.config import VisionConfig
+from turbopi.engine.smolvla import Prefix, Vision
+from turbopi.kernels.ops import fused_ops
+from turbopi.kernels.plain import PLAIN
+from turbopi.kernels.portable.ops import portable_ops
+from turbopi.models.observation import Observation
+from turbopi.models.smolvla.config import SmolVLAConfig, TextConfig
+from turbopi.models.smolvla.reference import SmolVLAModel
+
+ON_GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if ON_GPU else "cpu")
+DTYPE = torch.bfloat16 if ON_GPU else torch.float32
+pytestmark = gpu_or_interpreter()
+
+
+def model(**sizes: object) -> SmolVLAModel:
+    text = TextConfig(width=64, mlp_dim=48, num_heads=6, num_kv_heads=2, head_dim=16, vocab_size=20, depth=4)
+    vision = VisionConfig(width=32, depth=2, mlp_dim=48, num_heads=2, patch_size=4, image_size=16)
+    config = SmolVLAConfig(vision, text, expert_width=48, expert_mlp=80, image_size=16, max_prompt_tokens=7, **sizes)
+    made, generator = SmolVLAModel(config), torch.Generator().manual_seed(1)
+    for name, parameter in made.named_parameters():
+        torch.nn.init.normal_(parameter, std=parameter.shape[-1] ** -0.5, generator=generator)
+        if "norm" in name and name.endswith("weight"):
+            parameter.data = 1 + 0.3 * parameter.data
+    return made.to(DEVICE).eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "cameras", "prompt"),
+    [
+        ({"expert_depth": 4}, 2, 3),
+        ({"expert_depth": 2, "image_start": (3, 4), "image_end": (5,)}, 1, 7),
+        ({"expert_depth": 2, "self_every": 3}, 1, 1),
+        ({"expert_depth": 4, "self_every": None}, 2, 5),
+    ],
+)
+def test_keys_and_values_are_the_references(sizes: dict[str, object], cameras: int, prompt: int) -> None:
+    made, generator = model(**sizes), torch.Generator().manual_seed(2)
+    # the library's GELU on a CPU is another one than on a GPU
+    ops = fused_ops(DEVICE) if ON_GPU else replace(portable_ops(), linear_gelu=PLAIN.linear_gelu)
+    images = (torch.rand(cameras, 16, 16, 3, generator=generator) * 2 - 1).to(DEVICE)
+    tokens = torch.randint(20, (1, prompt), generator=generator).to(DEVICE)
+    state = torch.randn(1, 32, generator=generator).to(DEVICE)
+    everywhere = torch.ones(1, max(cameras, prompt), dtype=torch.bool, device=DEVICE)
+    observation = Observation(images[None], everywhere[:, :cameras], tokens, everywhere[:, :prompt], state)
+    cache = made.prefix(observation)
+    beside = [(cache.k[i], cache.v[i]) for i in made.config.expert_at]
+    crossed = made.cross_keys_values(cache)
+    exact = [own if other is None else other for own, other in zip(beside, crossed, strict=True)]
+
+    vision, prefix = Vision.pack(made, ops, DTYPE), Prefix.pack(made, ops, DTYPE)
+    embedded = vision(images)
+    near = 3e-2 if ON_GPU else 2e-5
+    assert relative(_numpy(embedded), _numpy(made.embed_images(images))) <= near
+    padded = torch.zeros(7, dtype=torch.int64, device=DEVICE)
+    padded[:prompt] = tokens[0]
+    length = torch.tensor([prefix.before_prompt(cameras) + prompt + 1], device=DEVICE)
+    x = prefix.embed(embedded, padded, state, length)
+    assert len(x) == prefix.places(cameras) and int(length) == int(cache.lengths)
+    keys, values = prefix.of_expert(*prefix.keys_values(x, length))
+    for i, (k, v) in enumerate(exact):
+        for ours, theirs in ((keys[i], k[0]), (values[i], v[0])):
+            assert relative(_numpy(ours[:, : int(length)]), _numpy(theirs)) <= near, i
+
+
+def _numpy(x: Tensor) -> np.ndarray:
+    return x.float().cpu().numpy()

@@ -1,0 +1,99 @@
+"""SmolVLA's denoising loop in the portable kernel, run on a CPU thread by thread, against the reference's loop."""
+
+import copy
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from emulator import emulate
+from smolvla_golden import relative
+from test_kernels_portable_denoise_emulated import Emulated
+from torch import Tensor
+
+from turbopi.engine.smolvla import Expert
+from turbopi.kernels.portable.denoise import kernel as denoise
+from turbopi.models.pi0.kv_cache import KVCache
+from turbopi.models.smolvla.config import SmolVLAConfig, TextConfig
+from turbopi.models.smolvla.reference import SmolVLAModel
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")]
+CPU = torch.device("cpu")
+SMALL = TextConfig(width=64, mlp_dim=48, num_heads=6, num_kv_heads=2, head_dim=16, vocab_size=20, depth=4)
+
+
+def model(seed: int, **sizes: Any) -> SmolVLAModel:
+    made = SmolVLAModel(SmolVLAConfig(text=SMALL, expert_width=48, expert_mlp=80, action_dim=16, **sizes))
+    generator = torch.Generator().manual_seed(seed)
+    for name, parameter in made.named_parameters():
+        spread = 0.2 if name.startswith("action") else parameter.shape[-1] ** -0.5
+        torch.nn.init.normal_(parameter, std=spread, generator=generator)
+        if "norm" in name and name.endswith("weight"):
+            parameter.data = 1 + 0.3 * parameter.data
+        parameter.data = parameter.data.bfloat16().float()
+    return made.eval().requires_grad_(False)
+
+
+def cache(made: SmolVLAModel, rows: int, length: int) -> KVCache:
+    text, generator = made.config.text, torch.Generator().manual_seed(7)
+    shape = (text.depth, 1, text.num_kv_heads, rows, text.head_dim)
+    k, v = (torch.randn(shape, generator=generator).bfloat16().float() for _ in range(2))
+    return KVCache(k, v, torch.arange(rows)[None] < length, torch.tensor([length]), k.new_zeros(1, 0, text.width))
+
+
+def run(
+    made: SmolVLAModel,
+    kept: KVCache,
+    noise: Tensor,
+    steps: int,
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    blocks: int,
+    choice: denoise.Choices | None = None,
+) -> Tensor:
+    def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
+        return Emulated(sizes, folder, 0, prepare=False), Emulated(sizes, folder, 0, prepare=True)
+
+    monkeypatch.setattr(denoise, "load", load)
+    monkeypatch.setattr(denoise, "unavailable", lambda device, weights: None)
+    monkeypatch.setattr(denoise, "has_large_l2", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    expert = Expert.pack(made)
+    of_expert = [(kept.k[i], kept.v[i]) for i in made.config.expert_at]
+    crossed = made.cross_keys_values(kept)
+    given = [own if other is None else other for own, other in zip(of_expert, crossed, strict=True)]
+    keys, values = (torch.cat(parts).bfloat16() for parts in zip(*given, strict=True))
+    kernel = expert.denoiser(
+        steps, cache_rows=keys.shape[2], suffix=len(noise), device=CPU, blocks=blocks, choice=choice
+    )
+    x_t = torch.full((steps + 1, *noise.shape), torch.nan)
+    v_t = torch.full((steps, *noise.shape), torch.nan)
+    kernel.launch(noise, keys, values, kept.lengths, x_t, v_t)
+    return x_t[-1]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "suffix", "length", "blocks"),
+    [
+        ({"self_every": 2, "expert_depth": 4}, 10, 21, 3),
+        ({"self_every": 2, "expert_depth": 2}, 3, 5, 1),  # beside every second text layer: all are self layers
+        ({"self_every": 0, "expert_depth": 4}, 17, 30, 2),
+        ({"self_every": None, "expert_depth": 4}, 50, 30, 4),
+        ({"self_every": 3, "expert_depth": 4}, 10, 460, 3),  # keys in several shares
+    ],
+)
+def test_the_loop_is_as_exact_as_ordinary_bf16(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sizes: dict[str, Any], suffix: int, length: int, blocks: int
+) -> None:
+    steps, made = 2, model(1, **sizes)
+    kept = cache(made, length + 9, length)
+    noise = torch.randn(suffix, 16, generator=torch.Generator().manual_seed(3))
+    exact = made.denoise(kept, noise[None], steps)[0]
+    ordinary = copy.deepcopy(made)
+    ordinary.expert.bfloat16()
+    ours = run(made, kept, noise, steps, monkeypatch, tmp_path, blocks)
+    error, usual = (
+        relative(one.numpy(), exact.numpy()) for one in (ours, ordinary.denoise(kept, noise[None], steps)[0])
+    )
+    assert 0 < error <= 1.1 * usual, (error, usual)
