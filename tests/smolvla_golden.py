@@ -32,10 +32,10 @@ def make_checkpoint(name: str, folder: Path) -> Path:
 class GoldenRuns:
     """A case's observations and what LeRobot computed from them."""
 
-    def __init__(self, name: str) -> None:
-        self.described = json.loads((GOLDEN / name / "case.json").read_text())
-        self._inputs = dict(np.load(GOLDEN / name / "inputs.npz"))
-        self._expected = dict(np.load(GOLDEN / name / "expected.npz"))
+    def __init__(self, name: str, golden: Path = GOLDEN) -> None:
+        self.described = json.loads((golden / name / "case.json").read_text())
+        self._inputs = dict(np.load(golden / name / "inputs.npz"))
+        self._expected = dict(np.load(golden / name / "expected.npz"))
 
     @property
     def noise(self) -> np.ndarray:

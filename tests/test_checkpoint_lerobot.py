@@ -147,8 +147,6 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
         ({"paligemma_variant": "gemma_9b"}, "paligemma_variant is 'gemma_9b'; expected one of gemma_300m, gemma_2b"),
         ({"action_expert_variant": 300}, "action_expert_variant is 300; expected one of gemma_300m, gemma_2b"),
         ({"max_period": 8.0}, "max_period = 8.0"),
-        ({"use_visual_memory": True}, "use_visual_memory = True, which Turbo-Pi doesn't compute"),
-        ({"use_proprioceptive_memory": True, "use_visual_memory": False}, "use_proprioceptive_memory = True"),
         ({"rtc_config": {"mode": "hard", "enabled": True}}, "mode is 'hard'; expected one of guided, trained"),
         ({"chunk_size": None}, "chunk_size is None; expected a whole number from 1"),
         ({"chunk_size": "50"}, "chunk_size is '50'; expected a whole number"),

@@ -3,6 +3,7 @@ interpreter.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ DTYPE = torch.bfloat16 if ON_GPU else torch.float32
 pytestmark = gpu_or_interpreter()
 
 
-def model(**sizes: object) -> SmolVLAModel:
+def model(**sizes: Any) -> SmolVLAModel:
     text = TextConfig(width=64, mlp_dim=48, num_heads=6, num_kv_heads=2, head_dim=16, vocab_size=20, depth=4)
     vision = VisionConfig(width=32, depth=2, mlp_dim=48, num_heads=2, patch_size=4, image_size=16)
     config = SmolVLAConfig(vision, text, expert_width=48, expert_mlp=80, image_size=16, max_prompt_tokens=7, **sizes)

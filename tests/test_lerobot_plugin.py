@@ -12,6 +12,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import memory_golden
 import numpy as np
 import pytest
 import smolvla_golden
@@ -94,6 +95,23 @@ def test_smolvlas_actions_are_lerobots(ran_smolvla: Path, name: str) -> None:
     for key in [*runs, "selected_actions"]:
         steps = min(len(found[key]), len(stored[key]))
         assert rms(found[key][:steps], stored[key][:steps]) <= 2e-5, key
+
+
+def test_memory_is_lerobots_call_by_call(joining: tuple[Path, tuple[str, ...]], tmp_path: Path) -> None:
+    """With the prompts of LeRobot's processors, which have the state. LeRobot 0.6.1 has no memory."""
+    if "trained" not in joining[1]:
+        pytest.skip("this LeRobot has no memory")
+    for name in memory_golden.CASES:
+        (tmp_path / name).mkdir()
+        memory_golden.make_checkpoint(name, tmp_path / name / "checkpoint")
+        for file in ("case.json", "inputs.npz"):
+            shutil.copy(memory_golden.GOLDEN / name / file, tmp_path / name)
+    done = in_lerobot("-m", "lerobot_cases.memory", tmp_path)
+    assert done.returncode == 0, done.stderr[-4000:]
+    for name in memory_golden.CASES:
+        found, stored = np.load(tmp_path / name / "plugin.npz"), np.load(memory_golden.GOLDEN / name / "expected.npz")
+        for key in found.files:
+            assert rms(found[key], stored[key]) <= 2e-6, (name, key)
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in OTHER_SIZES and "peft" not in name])

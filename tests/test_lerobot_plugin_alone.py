@@ -3,11 +3,13 @@
 import json
 import re
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import lerobot_fakes
+import memory_golden
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from checkpoint_helpers import edit_json
 from lerobot_golden import GOLDEN, GoldenCase, _observation
 
 from turbopi import UnifiedPolicy
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.serve import PolicyServer, running
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
@@ -217,11 +219,53 @@ def test_turbopi_itself_runs_behind_it(modeling: Any, checkpoint: Path) -> None:
         policy.predict_action_chunk(batch(), num_steps=0)
 
 
+@pytest.mark.parametrize("served", [False, True])
+def test_memory_is_of_each_row_and_ends_with_its_episode(modeling: Any, tmp_path: Path, served: bool) -> None:
+    """An entry a call, also while queued actions play; here or on a server."""
+    folder = memory_golden.make_checkpoint("visual", tmp_path / "checkpoint")
+    golden, wrong = memory_golden.MemoryRuns("visual"), batch(2)
+    options: dict[str, Any] = {"backend": "pytorch", "precision": "f32", "device": "cpu"}
+    exact = UnifiedPolicy(folder, **options)
+
+    def shown(run: int) -> dict[str, Any]:
+        sent: dict[str, Any] = golden.observation(run)
+        made = {key: torch.from_numpy(value)[None] for key, value in sent.items() if key != "task"}
+        images = {key: value.permute(0, 3, 1, 2) / 255 for key, value in made.items() if "images" in key}
+        made |= {key: torch.nn.functional.interpolate(value, (224, 224)) for key, value in images.items()}
+        inputs = exact.prepare(sent)
+        made["observation.language.tokens"] = torch.from_numpy(inputs.tokens)[None]
+        made["observation.language.attention_mask"] = torch.from_numpy(inputs.token_mask)[None]
+        return made | {"task": [sent["task"]]}
+
+    with running(exact) if served else nullcontext() as server:
+        where: dict[str, Any] = {"checkpoint": str(folder), **options, "warmup": False}
+        if served:
+            assert server is not None
+            where = {"server": f"ws://127.0.0.1:{server.port}"}
+        policy = modeling.TurboPiPolicy(modeling.TurboPiConfig(**where, n_action_steps=2))
+        for episode in range(2):
+            for run in (0, 3, 1, 2, 3):
+                policy.select_action(shown(run))
+                if run == 2:
+                    policy.drop_queued_actions()  # the task changes: memory stays
+            if server is None:
+                (kept,) = policy._histories
+            else:
+                assert server._histories is not None
+                (kept,) = (robot.history for robot in server._histories._robots.values())
+            assert kept.observations == 5, episode
+            with pytest.raises(ObservationError, match=r"2 rows"):
+                policy.predict_action_chunk(wrong)
+            policy.reset()
+
+
 # -- real-time chunking ------------------------------------------------------------------------------------------------
 
 
 def prepared(policy: Any, observation: dict[str, Any]) -> dict[str, torch.Tensor]:
     """A robot's observation, as LeRobot's preprocessor passes it on."""
+    # the plugin's own reads no prompts
+    policy.turbopi.pipeline.tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=1024)
     inputs = policy.turbopi.prepare(observation)
     images = torch.from_numpy(inputs.images).permute(0, 3, 1, 2).add(1).div(2)
     return {
@@ -234,7 +278,7 @@ def prepared(policy: Any, observation: dict[str, Any]) -> dict[str, torch.Tensor
 
 
 def loaded(modeling: Any, checkpoint: Path, **changed: Any) -> Any:
-    """A policy of the checkpoint with its config changed, in float32, with a tokenizer that reads prompts."""
+    """A policy of the checkpoint with its config changed, in float32."""
     edit_json(checkpoint / "config.json", lambda content: content.update(changed))
     return modeling.TurboPiPolicy(
         modeling.TurboPiConfig(checkpoint=str(checkpoint), backend="pytorch", precision="f32", warmup=False)

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "turbopi"
-OTHER_FAMILIES = ("tests/golden_pi0_fast/", "tests/golden_smolvla/")
+OTHER_FAMILIES = ("tests/golden_memory/", "tests/golden_pi0_fast/", "tests/golden_smolvla/")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_clone_stays_small() -> None:
-    """24 MiB of tracked files, and 4 for golden cases of other families than Pi0 and Pi0.5."""
+    """24 MiB of tracked files, and 4 for golden cases of other families than Pi0 and Pi0.5 without memory."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
         pytest.skip("not a git checkout")

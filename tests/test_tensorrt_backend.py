@@ -25,10 +25,6 @@ CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 BOTH = (TensorRTBackend, TensorRTPipelinedBackend)
 
 
-def first(observation: Observation) -> Observation:
-    return Observation(*(getattr(observation, name)[:1] for name in observation.__dataclass_fields__))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("cls", BOTH)
 @pytest.mark.parametrize("case", CASES)
@@ -67,7 +63,7 @@ def test_denoising_a_cache_is_what_the_reference_does_with_it(tmp_path: Path) ->
     for call in backend._calls.values():
         call.cache_k.fill_(torch.nan)
         call.cache_v.fill_(torch.nan)
-    observation, model = first(one.observation), golden_model("pi05")
+    observation, model = one.observation.row(0), golden_model("pi05")
     cache = model.prefix(observation)
     expected = model.denoise(cache, one.noise[:1], 2)
     torch.testing.assert_close(backend.denoise(cache, one.noise[:1], 2), expected, atol=1e-5, rtol=1e-5)
@@ -127,7 +123,7 @@ def test_warmup_loads_every_cached_set_and_calls_take_the_smallest_that_fits(tmp
     short, long = EngineShape(3, 64, H), EngineShape(3, 208, H)
     for shape in (short, long):
         backend._engines.prepare(shape)
-    observation = first(one.observation)
+    observation = one.observation.row(0)
     backend.warmup(observation, 2)
     assert backend.describe()["engines_for"] == [str(short), str(long)]
     tokens = torch.ones_like(observation.token_mask)
@@ -144,7 +140,7 @@ def test_warmup_loads_every_cached_set_and_calls_take_the_smallest_that_fits(tmp
 def test_pipelined_answers_are_the_unpipelined_ones_in_order(tmp_path: Path) -> None:
     one = golden_cases()["a_three_cams"]
     plain, pipelined = (golden_backend(cls, "pi05", tmp_path) for cls in BOTH)
-    observation = first(one.observation)
+    observation = one.observation.row(0)
     noises = [torch.randn(one.noise[:1].shape, generator=torch.Generator().manual_seed(i)) for i in range(5)]
     futures = [pipelined.submit(observation, noise, 2) for noise in noises]
     for noise, future in zip(noises, futures, strict=True):
@@ -155,7 +151,7 @@ def test_pipelined_answers_are_the_unpipelined_ones_in_order(tmp_path: Path) -> 
 
 def test_an_answer_isnt_overwritten_by_later_ones(tmp_path: Path) -> None:
     one, backend = golden_cases()["a_three_cams"], golden_backend(TensorRTPipelinedBackend, "pi05", tmp_path)
-    observation = first(one.observation)
+    observation = one.observation.row(0)
     answer = backend.submit(observation, one.noise[:1], 2).result(timeout=60).actions
     kept = answer.clone()
     for _ in range(3):
@@ -165,7 +161,7 @@ def test_an_answer_isnt_overwritten_by_later_ones(tmp_path: Path) -> None:
 
 def test_a_failing_observation_frees_its_buffers(tmp_path: Path) -> None:
     one, backend = golden_cases()["a_three_cams"], golden_backend(TensorRTPipelinedBackend, "pi05", tmp_path)
-    observation = first(one.observation)
+    observation = one.observation.row(0)
     backend.warmup(observation, 2)
     none = dataclasses.replace(observation, image_mask=torch.tensor([[True, False, False]]))
     for _ in range(3):
@@ -185,16 +181,14 @@ def test_waiting_for_free_buffers_is_told_apart_from_the_work(tmp_path: Path, mo
             return super().acquire(*arguments)
 
     backend._slots[1].free = Busy(1)
-    submitted = [backend.submit(first(one.observation), torch.zeros(1, H, 32), 2) for _ in range(3)]
+    submitted = [backend.submit(one.observation.row(0), torch.zeros(1, H, 32), 2) for _ in range(3)]
     assert [future.result(timeout=60).queue_ms for future in submitted] == [0, 1500, 0]
 
 
 def test_submit_takes_one_observation() -> None:
     one = golden_cases()["e_horizon50"] if golden_cases()["e_horizon50"].observation.batch_size > 1 else None
     batch = one or golden_cases()["a_three_cams"]
-    doubled = type(batch.observation)(
-        *(torch.cat([getattr(batch.observation, f)] * 2) for f in batch.observation.__dataclass_fields__)
-    )
+    doubled = Observation.joined([batch.observation] * 2)
     backend = TensorRTPipelinedBackend.__new__(TensorRTPipelinedBackend)
     with pytest.raises(BackendError, match="submit takes one observation at a time, not"):
         backend.submit(doubled, batch.noise, 2)

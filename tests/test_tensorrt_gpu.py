@@ -18,7 +18,6 @@ from turbopi.backends.tensorrt.calibrate import calibrate, unavailable
 from turbopi.backends.tensorrt.engine import Engine, Input, Kernels, Specification, build
 from turbopi.backends.tensorrt.fp8 import TensorRTFp8Backend
 from turbopi.backends.tensorrt.ops import NetworkOps
-from turbopi.models.observation import Observation
 from turbopi.models.pi0.denoise import time_embedding, time_grid
 from turbopi.models.pi0.vision import normalize_images
 from turbopi.support.errors import BackendError
@@ -52,10 +51,6 @@ def made(name: str, kind: str = "pi05") -> backends.Backend:
     )
 
 
-def first(observation: Observation) -> Observation:
-    return Observation(*(getattr(observation, name)[:1] for name in observation.__dataclass_fields__))
-
-
 @pytest.mark.parametrize("name", ["tensorrt", "tensorrt_pipelined"])
 @pytest.mark.parametrize("case", CASES)
 def test_golden_cases_are_within_openpis_own_error(name: str, case: str) -> None:
@@ -67,7 +62,7 @@ def test_golden_cases_are_within_openpis_own_error(name: str, case: str) -> None
 
 def test_actions_in_flight_are_those_of_one_at_a_time_bit_for_bit() -> None:
     one = golden_cases()["a_three_cams"]
-    observation = first(one.observation)
+    observation = one.observation.row(0)
     noises = [torch.randn(one.noise[:1].shape, generator=torch.Generator().manual_seed(i)) for i in range(12)]
     plain, pipelined = made("tensorrt"), made("tensorrt_pipelined")
     expected = [plain.sample(observation, noise, 10).actions for noise in noises]
@@ -85,7 +80,7 @@ def test_fp8_actions_point_the_same_way(
     alike = [golden_cases()[name] for name in CASES if golden_cases()[name].kind == one.kind]
     method = "modelopt" if unavailable("modelopt") is None else "max"
     model = copy.deepcopy(golden_model(one.kind))  # ModelOpt changes it
-    calibration = calibrate(model, [first(other.observation) for other in alike], method=method)
+    calibration = calibrate(model, [other.observation.row(0) for other in alike], method=method)
     monkeypatch.setattr(TensorRTFp8Backend, "calibration", calibration)
     record_property("calibration", calibration.method)
     backend = made("tensorrt_fp8", one.kind)
@@ -106,7 +101,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], "Expor
     @cache
     def export(fp8: bool) -> "Export":
         model = golden_model("pi05")
-        observed = [first(golden_cases()["a_three_cams"].observation)]
+        observed = [golden_cases()["a_three_cams"].observation.row(0)]
         folder = tmp_path_factory.mktemp("exports") / ("fp8" if fp8 else "f32")
         return export_onnx(model, folder, calibration=calibrate(model, observed) if fp8 else None)
 
@@ -143,7 +138,7 @@ def test_an_exported_graph_is_an_engine(
 
 def graph_inputs(graph: str) -> dict[str, torch.Tensor]:
     """Of one observation with three cameras and 21 prompt tokens; the cache is the model's own."""
-    model, observation = golden_model("pi05"), first(golden_cases()["a_three_cams"].observation)
+    model, observation = golden_model("pi05"), golden_cases()["a_three_cams"].observation.row(0)
     observation = dataclasses.replace(observation, token_mask=torch.arange(200)[None] < 21)
     embedded = model.embed(observation)
     mask = torch.ones(1, embedded.embs.shape[1], dtype=torch.bool)

@@ -36,7 +36,12 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
     "head_dim": 4096,
     "patch_size": 1024,
     "image_size": 4096,
+    "frames": 64,
+    "stride": 2048,
+    "temporal_every": 256,
+    "state_dim": 1024,
 }
+MOST_REMEMBERED = 2048  # observations of an episode that a policy with memory keeps: 1.2 GB for each camera
 
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4", "lerobot_smolvla"]  # how, see preprocess/images.py
@@ -84,6 +89,29 @@ class GemmaConfig:
     head_dim: int = 256
 
 
+@dataclass(frozen=True)
+class MemoryConfig:
+    """Past observations that a Pi0.5 sees: MEM (arXiv 2603.03596), as LeRobot's main branch has it.
+
+    visual          in every `temporal_every`-th layer of SigLIP each patch attends over its past frames
+    proprioceptive  past states, with the current one, are tokens between images and prompt
+    frames, stride  so many observations, the current one included, and how many lie from one to the next
+    state_dim       width of these states
+    """
+
+    visual: bool
+    proprioceptive: bool
+    frames: int = 6
+    stride: int = 30
+    temporal_every: int = 4
+    state_dim: int = 32
+
+    @property
+    def length(self) -> int:
+        """Observations from the oldest frame to the current one."""
+        return (self.frames - 1) * self.stride + 1
+
+
 class Network(Protocol):
     """What the edges of a policy ask of a network's sizes, whatever its family. Always a frozen dataclass.
 
@@ -127,6 +155,7 @@ class ModelConfig:
     rms_norm_eps: float = 1e-6
     rope_base: float = 10_000.0
     time_grid: TimeRounding = "accumulated"
+    memory: MemoryConfig | None = None
 
     @property
     def image_size(self) -> int:
@@ -136,7 +165,8 @@ class ModelConfig:
     @property
     def state_dim(self) -> int:
         """Numbers of state that the network takes."""
-        return self.action_dim
+        reads_states = self.memory is not None and self.memory.proprioceptive
+        return self.memory.state_dim if self.memory is not None and reads_states else self.action_dim
 
     def __post_init__(self) -> None:
         """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
@@ -146,6 +176,8 @@ class ModelConfig:
             raise ConfigError(f"time_grid is {shown(self.time_grid)}; expected 'accumulated' or 'multiplied'")
         for name, part in (("", self), ("vision ", self.vision), ("vlm ", self.vlm), ("expert ", self.expert)):
             _check_sizes(name, part)
+        if self.memory is not None:
+            _check_sizes("memory ", self.memory)
         for attribute in ("depth", "num_heads", "num_kv_heads", "head_dim"):
             ours, theirs = getattr(self.vlm, attribute), getattr(self.expert, attribute)
             if ours != theirs:
@@ -156,9 +188,32 @@ class ModelConfig:
             raise ConfigError(f"{self.vlm.num_heads} query heads don't divide by {self.vlm.num_kv_heads} KV heads")
         if self.expert.head_dim % 2 or self.expert.width % 2:
             raise ConfigError("RoPE and the time embedding need an even head_dim and an even expert width")
+        if self.memory is not None:
+            self._check_memory(self.memory)
+
+    def _check_memory(self, memory: MemoryConfig) -> None:
+        if self.kind != "pi05" or not (memory.visual or memory.proprioceptive):
+            raise ConfigError("memory is visual, proprioceptive or both, and of pi05 alone")
+        if memory.length > MOST_REMEMBERED:
+            raise ConfigError(
+                f"{memory.frames} frames that lie {memory.stride} observations apart need the last {memory.length}; at "
+                f"most {MOST_REMEMBERED} are kept"
+            )
+        if memory.visual and memory.temporal_every > self.vision.depth:
+            raise ConfigError(
+                f"every {memory.temporal_every}th layer of vision attends over frames, but there are "
+                f"{self.vision.depth}: none would"
+            )
+        if memory.visual and self.vision.width % 2:
+            raise ConfigError(f"frame positions need an even vision width, not {self.vision.width}")
 
 
-def _check_sizes(name: str, part: ModelConfig | VisionConfig | GemmaConfig) -> None:
+def memory_of(model: Network) -> MemoryConfig | None:
+    """A network's memory; None if it sees the current observation alone."""
+    return model.memory if isinstance(model, ModelConfig) else None
+
+
+def _check_sizes(name: str, part: ModelConfig | VisionConfig | GemmaConfig | MemoryConfig) -> None:
     for one in dataclasses.fields(part):
         value, limit = getattr(part, one.name), LIMITS.get(one.name)
         if limit is not None and not (is_integer(value) and 1 <= value <= limit):
@@ -225,11 +280,12 @@ class PolicyConfig:
 
         Raises ConfigError for a family that runs as its reference alone.
         """
-        if not isinstance(self.model, ModelConfig):
+        if not isinstance(self.model, ModelConfig) or self.model.memory is not None:
+            what = f"{self.model.kind}{' with memory' if isinstance(self.model, ModelConfig) else ''}"
             raise ConfigError(
-                f"{self.name} is a {self.model.kind} policy, and this is for Pi0 and Pi0.5 alone: there are no "
-                f"kernels, engines, calibrations or conversions of a {self.model.kind} yet. `turbopi infer`, `serve`, "
-                "`eval` and `inspect` take it, on backends 'pytorch' and 'cuda_graph'"
+                f"{self.name} is a {what} policy, and this is for Pi0 and Pi0.5 alone: there are no "
+                f"kernels, engines, calibrations or conversions of a {what} yet. `turbopi infer`, `serve` "
+                "and `inspect` take it, on backends 'pytorch' and 'cuda_graph'"
             )
         return self.model
 

@@ -216,8 +216,7 @@ def test_episodes_at_other_calls_and_with_other_prompts_are_reused_together_as_a
     ]
     batches = []
     for rows in ([0], [1, 2], [3, 4]):
-        names = Observation.__dataclass_fields__
-        joined = Observation(*(torch.cat([getattr(calls[i][2], name) for i in rows]) for name in names))
+        joined = Observation.joined([calls[i][2] for i in rows])
         episodes, numbers = [calls[i][0] for i in rows], [calls[i][1] for i in rows]
         batches += list(together.answer(joined, noise[rows].flatten(0, 1), 2, episodes, numbers))
     assert 0 < sum(alone.shares) < 5 and alone.shares == together.shares

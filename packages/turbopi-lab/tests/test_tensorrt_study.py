@@ -28,8 +28,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("two_layers", "unseen_pl
 
 def one() -> tuple[Observation, torch.Tensor]:
     case = golden_cases()["b_third_masked"]
-    o = case.observation
-    return Observation(*(getattr(o, name)[:1] for name in o.__dataclass_fields__)), case.noise[:1]
+    return case.observation.row(0), case.noise[:1]
 
 
 def finite(value: float | None) -> float:

@@ -1,5 +1,7 @@
 """Backend `cuda_graph` for families that the engine has no plan for: their reference, compiled and captured.
 
+A reference whose own methods are other ones gives the captured ones by its `stages`.
+
 An observation is three kinds of graph for so many cameras: "vision", "prefix", for a prompt of any length, and "step",
 one evaluation of the expert. The loop around the steps is the reference's own (`integrate`), so it takes whatever that
 does but gradients. Images are resized on the device.
@@ -19,11 +21,11 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
-from turbopi.config import ImageResize
+from turbopi.config import ImageResize, memory_of
 from turbopi.engine.graph import Graph, building
 from turbopi.engine.plan import cold_call
 from turbopi.engine.resize import Resizer
-from turbopi.models.observation import Observation
+from turbopi.models.observation import Observation, Past, PastObservation, past_of, remembering
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, of_rows
 from turbopi.models.pi0.integrate import integrate
 from turbopi.models.pi0.kv_cache import KVCache
@@ -89,7 +91,8 @@ class CapturedBackend(PyTorchBackend):
     def load_weights(self, load: LoadState) -> None:
         make_caches_writable()
         super().load_weights(load)
-        if self.precision == "bf16":
+        self._stages = getattr(self.model, "stages", self.model)
+        if self.precision == "bf16" and hasattr(self.model, "attend"):
             self.model.attend = _attend
         self._graphs: dict[int, Graphs] = {}  # by number of cameras
         self._pool = torch.cuda.graph_pool_handle()
@@ -97,7 +100,7 @@ class CapturedBackend(PyTorchBackend):
         self._times: dict[bytes, Tensor] = {}
         self._turn: object = None  # of the observation whose images are in the inputs
         self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
-        stages = (self.model.embed_images, self._prefix_stage, self.model.velocity)
+        stages = (self._stages.embed_images, self._prefix_stage, self._stages.velocity)
         self._embed_images, self._prefix_of, self._velocity = map(self._stage, stages)
 
     def warmup(
@@ -121,13 +124,14 @@ class CapturedBackend(PyTorchBackend):
         resize: ImageResize | None = None,
         forms: Sequence[Form] | None = None,
     ) -> BegunBatch:
-        return _Begun(self, images, resize or "lerobot")
+        return _Begun(self, images, resize or "lerobot", [Past()] * len(images))
 
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        images, tokens, state = _on_host(observation)
-        return self.begin_batch(images).finish(tokens, state, noise.cpu().numpy(), num_steps, conditioning)
+        images, pasts, tokens, state = _on_host(observation)
+        begun = _Begun(self, images, "lerobot", pasts)
+        return begun.finish(tokens, state, noise.cpu().numpy(), num_steps, conditioning)
 
     def prefix(self, observation: Observation) -> KVCache:
         raise self._lacks("halves of a call", "call `sample`")
@@ -140,15 +144,19 @@ class CapturedBackend(PyTorchBackend):
     ) -> Trace:
         """Of the captured graphs, one observation after the other: places of the prefix that none has are 0."""
         self.check_conditioning(conditioning)
-        images, tokens, state = _on_host(observation)
+        images, pasts, tokens, state = _on_host(observation)
         traces = []
         for row, one in enumerate(of_rows(conditioning, len(tokens))):
-            turn, inputs = self.see(images[row], "lerobot"), (tokens[row], state[row], noise[row].cpu().numpy())
+            turn = self.see(images[row], "lerobot", pasts[row])
+            inputs = tokens[row], state[row], noise[row].cpu().numpy()
             timer = StageTimer(self.device)
             done = self.answer(turn, len(images[row]), *inputs, num_steps, one, timer, keep=True)
             cache = self._graphs[len(images[row])].cache
             assert cache.mask is not None
-            trace = {name: part[:, :, :, cache.mask[0]].transpose(2, 3) for name, part in _parts(cache)}
+            parts = {name: part[:, :, :, cache.mask[0]] for name, part in _parts(cache)}
+            if isinstance(observation, PastObservation):
+                parts = {name: self._stages.to_padded(part, observation.row(row)) for name, part in parts.items()}
+            trace = {name: part.transpose(2, 3) for name, part in parts.items()}
             trace["x_t"] = torch.stack([x for x, _ in done.evaluations] + [done.actions])
             trace["v_t"] = torch.stack([v for _, v in done.evaluations])
             traces.append(trace | {"actions": done.actions})
@@ -159,8 +167,8 @@ class CapturedBackend(PyTorchBackend):
 
     # -- one observation -----------------------------------------------------------------------------------------------
 
-    def see(self, images: Images, resize: ImageResize) -> object:
-        """Start on its images; what `answer` needs to know that nobody else has started since."""
+    def see(self, images: Images, resize: ImageResize, past: Past) -> object:
+        """Start on its images, and those before; what `answer` needs to know that nobody else has started since."""
         if self.strict and len(images) not in self._graphs:
             raise self._cold(len(images), self.config.action_horizon)
         graphs = self._captured(len(images))
@@ -173,6 +181,8 @@ class CapturedBackend(PyTorchBackend):
                 place.copy_(fit_unit(on_device[None].float() / 255, tuple(place.shape[:2]), resize)[0])
         if graphs.resizer is not None:
             graphs.resizer.upload([None if one.dtype == np.float32 else one for one in images], resize)
+        for name, place in past_of(graphs.inputs).parts.items():
+            place.copy_(getattr(past, name))
         graphs.vision.launch()
         self._turn = object()
         return self._turn
@@ -235,14 +245,14 @@ class CapturedBackend(PyTorchBackend):
     def _stage(self, stage: Callable[..., Any]) -> Callable[..., Any]:
         return compile_stage(stage, dynamic=False) if self._compiles else stage
 
-    def _vision(self, images: Tensor, mark: Callable[[str], None]) -> Tensor:
-        return self._embed_images(images)
+    def _vision(self, observation: Observation, mark: Callable[[str], None]) -> Tensor:
+        return self._embed_images(observation if isinstance(observation, PastObservation) else observation.images[0])
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, Any]:
-        prefix = self.model.embed_prefix(observation, embedded=embedded)
-        k, v, _ = self.model.encode_prefix(prefix)
-        cache = self.model.cache_of(prefix, k, v)
-        return cache, self.model.cross_keys_values(cache), None
+        prefix = self._stages.embed_prefix(observation, embedded=embedded)
+        k, v, _ = self._stages.encode_prefix(prefix)
+        cache = self._stages.cache_of(prefix, k, v)
+        return cache, self._stages.cross_keys_values(cache), None
 
     def _captured(self, cameras: int) -> Graphs:
         if cameras not in self._graphs:
@@ -259,6 +269,8 @@ class CapturedBackend(PyTorchBackend):
             torch.ones(1, prompt, dtype=torch.bool),
             torch.zeros(1, config.state_dim),
         ).to(self.device)
+        if (memory := memory_of(config)) is not None:
+            inputs = remembering(inputs, memory)
         images: list[Tensor] = []
         left: list[tuple[KVCache, Any, Any]] = []
 
@@ -269,7 +281,7 @@ class CapturedBackend(PyTorchBackend):
                 from turbopi.kernels.portable.resize import resize_images
 
                 resize_images(resizer.table, inputs.images[0])
-            images[:] = [self._vision(inputs.images[0], mark)]
+            images[:] = [self._vision(inputs, mark)]
             mark("vision")
 
         def prefix(mark: Callable[[str], None]) -> None:
@@ -310,17 +322,19 @@ class CapturedBackend(PyTorchBackend):
         if key not in self._times:
             if len(self._times) >= 64:
                 self._times.clear()
-            self._times[key] = self.model.embed_times(times).to(self.device)
+            self._times[key] = self._stages.embed_times(times).to(self.device)
         return self._times[key]
 
 
 class _Begun:
     """`BegunBatch` of observations that run one by one; the device works on the first one's images already."""
 
-    def __init__(self, backend: CapturedBackend, images: Sequence[Images], resize: ImageResize) -> None:
-        self._backend, self._images, self._resize = backend, images, resize
+    def __init__(
+        self, backend: CapturedBackend, images: Sequence[Images], resize: ImageResize, pasts: Sequence[Past]
+    ) -> None:
+        self._backend, self._images, self._resize, self._pasts = backend, images, resize, pasts
         self._timer = StageTimer(backend.device)
-        self._turn = backend.see(images[0], resize)
+        self._turn = backend.see(images[0], resize, pasts[0])
         self._timer.mark("vision")
 
     def finish(
@@ -337,7 +351,7 @@ class _Begun:
         for row, one in enumerate(each):
             if row:
                 self._timer = StageTimer(self._backend.device)
-                self._turn = self._backend.see(self._images[row], self._resize)
+                self._turn = self._backend.see(self._images[row], self._resize, self._pasts[row])
                 self._timer.mark("vision")
             inputs = (tokens[row], state[row], noise[row], num_steps, one)
             made = self._backend.answer(self._turn, len(self._images[row]), *inputs, self._timer)
@@ -346,12 +360,13 @@ class _Begun:
         return Sample(torch.cat(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
 
 
-def _on_host(observation: Observation) -> tuple[list[Images], list[np.ndarray], np.ndarray]:
-    """Of each observation its valid images and prompt tokens; and the states."""
+def _on_host(observation: Observation) -> tuple[list[Images], list[Past], list[np.ndarray], np.ndarray]:
+    """Of each observation its valid images, those before, and prompt tokens; and the states."""
     host = observation.to("cpu")
     rows = range(host.batch_size)
     images: list[Images] = [list(host.images[row][host.image_mask[row]].numpy()) for row in rows]
-    return images, [host.tokens[row][host.token_mask[row]].numpy() for row in rows], host.state.numpy()
+    pasts = [past_of(host.row(row)).of_cameras(host.image_mask[row]) for row in rows]
+    return images, pasts, [host.tokens[row][host.token_mask[row]].numpy() for row in rows], host.state.numpy()
 
 
 def _parts(cache: KVCache) -> tuple[tuple[str, Tensor], tuple[str, Tensor]]:

@@ -93,8 +93,8 @@ class FusedSmolVLABackend(CapturedBackend):
         made = {"operations": dict(self._origin), "tiles": self._tiles.about, "denoising": denoising}
         return super().describe() | made
 
-    def _vision(self, images: Tensor, mark: Callable[[str], None]) -> Tensor:
-        return self._tower(images, lambda: mark(HEAD))
+    def _vision(self, observation: Observation, mark: Callable[[str], None]) -> Tensor:
+        return self._tower(observation.images[0], lambda: mark(HEAD))
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, _Attended]:
         config, prefix, cameras = self.config, self._prefix, embedded.shape[0]

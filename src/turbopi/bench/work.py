@@ -81,7 +81,8 @@ def stage_work(config: Network, job: Job, bytes_per_value: int) -> dict[str, Wor
         stages = counts(config, job.cameras, job.prompt_tokens, job.horizon, job.steps, job.batch)
         return {stage: Work(flops, values * bytes_per_value) for stage, (flops, values) in stages.items()}
     image_tokens = job.cameras * config.vision.num_tokens
-    prefix = image_tokens + job.prompt_tokens
+    states = config.memory.frames if config.memory is not None and config.memory.proprioceptive else 0
+    prefix = image_tokens + states + job.prompt_tokens
     suffix = job.horizon + family_of(config).state_token
     return {
         "vision": _vision(config, image_tokens, job.batch, bytes_per_value),
@@ -100,7 +101,15 @@ def _vision(config: ModelConfig, tokens: int, rows: int, value: int) -> Work:
     block = 4 * v.width**2 + 2 * v.width * v.mlp_dim
     weights = v.depth * block + 3 * v.patch_size**2 * v.width + v.width * config.vlm.width
     attention = v.depth * 4 * tokens * v.num_tokens * v.width  # q kᵀ and p v, within one image
-    return Work(rows * (2 * tokens * weights + attention), weights * value)
+    work = Work(rows * (2 * tokens * weights + attention), weights * value)
+    if config.memory is None or not config.memory.visual:
+        return work
+    past, every = config.memory.frames - 1, config.memory.temporal_every
+    layers = v.depth // every * every  # up to the last temporal one past frames go along
+    a_layer = 2 * block + 4 * v.num_tokens * v.width
+    more = past * tokens * (layers * a_layer + 2 * 3 * v.patch_size**2 * v.width)
+    over_frames = layers // every * tokens * 4 * (past + 1) ** 2 * v.width
+    return Work(work.flops + rows * (more + over_frames), work.bytes)
 
 
 def _layer_weights(g: GemmaConfig) -> tuple[int, int]:

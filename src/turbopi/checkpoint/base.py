@@ -18,7 +18,7 @@ from torch import Tensor
 from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
-from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig
+from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig, memory_of
 from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError
 
@@ -190,6 +190,7 @@ class Checkpoint:
             "time_grid": self.config.solver_grid,
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
+            "memory": None if (memory := memory_of(self.config.model)) is None else asdict(memory),
             "normalization": {
                 "state": self.config.normalization.state,
                 "actions": self.config.normalization.actions,

@@ -10,7 +10,7 @@ from pathlib import Path
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read_settings, values_of
 from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import WeightSource, listing
-from turbopi.config import GemmaConfig, PolicyConfig
+from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig
 from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import read_json, shown
@@ -83,7 +83,7 @@ def notes_on_settings(
         for key, value in theirs.items()
         if key != "name" and value != ours[key]
     ]
-    heads = {"vision_heads": policy.planned_model.vision.num_heads}
+    heads = {"vision_heads": policy.model.vision.num_heads} if isinstance(policy.model, ModelConfig) else {}
     others += [
         f"{key} = {shown(value)}"
         for key, value in beside.values.items()

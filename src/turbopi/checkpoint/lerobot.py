@@ -30,7 +30,18 @@ from turbopi.checkpoint.lerobot_pipeline import (
 from turbopi.checkpoint.names import Names, PiNames
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
-from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
+from turbopi.config import (
+    LIMITS,
+    MOST_REMEMBERED,
+    Kind,
+    MemoryConfig,
+    ModelConfig,
+    Normalization,
+    NormMode,
+    PolicyConfig,
+    RealTime,
+    Schedule,
+)
 from turbopi.models import FAMILIES, Family
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, file_inside, one_line, read_json, shown
@@ -71,7 +82,10 @@ class LeRobotFolder:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
         self.config = Fields(_read_config(folder), self.file)
         self.kind = self._check_config()
-        self.pipelines = Pipelines(folder, self.kind)
+        self.memory = self._memory()
+        # LeRobot trains it without the state in the prompt, and doesn't save that: a folder that it loads has it again
+        state_tokens = self.memory is not None and self.memory.proprioceptive
+        self.pipelines = Pipelines(folder, self.kind, state_tokens=state_tokens)
         self.stats, self._stats_files = self._read_stats()
         self.action_dim = self._width("output_features", ACTION, "max_action_dim")
         self.described_state_dim = self._width("input_features", STATE, "max_state_dim")
@@ -110,6 +124,7 @@ class LeRobotFolder:
             action_horizon=self._chunk_size,
             max_prompt_tokens=self.pipelines.max_tokens,
             time_grid="accumulated" if summed else "multiplied",
+            memory=self.memory,
         )
         return PolicyConfig(
             name=f"lerobot_{self.kind}",
@@ -211,6 +226,29 @@ class LeRobotFolder:
         for key, choices in _CHOICES.items():
             if self.config.values.get(key) is not None:
                 self.config.choice(key, choices)
+
+    def _memory(self) -> MemoryConfig | None:
+        """MEM's settings; None without memory."""
+        visual = self.config.flag("use_visual_memory", False)
+        proprioceptive = self.config.flag("use_proprioceptive_memory", False)
+        frames = self.config.integer("memory_frames", 1, LIMITS["frames"], default=6)
+        stride = self.config.integer("memory_stride", 1, LIMITS["stride"], default=30)
+        every = self.config.integer("memory_temporal_attention_every", 1, LIMITS["temporal_every"], default=4)
+        if not visual and not proprioceptive:
+            return None
+        if self.kind != "pi05":
+            key = f"use_{'visual' if visual else 'proprioceptive'}_memory"
+            raise CheckpointError(
+                f"{self.file} has {key} = True and type {self.kind!r}; LeRobot has memory in pi05 alone"
+            )
+        width = self.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
+        memory = MemoryConfig(visual, proprioceptive, frames, stride, every, width)
+        if memory.length > MOST_REMEMBERED:
+            raise CheckpointError(
+                f"{self.file} has memory_frames = {frames} and memory_stride = {stride}: the last {memory.length} "
+                f"observations, and Turbo-Pi keeps at most {MOST_REMEMBERED}"
+            )
+        return memory
 
     @property
     def _chunk_size(self) -> int:

@@ -52,9 +52,6 @@ _PERIODS: Mapping[str, tuple[tuple[object, ...], str]] = {
 _OF_PI_NEUTRAL: Mapping[str, tuple[tuple[object, ...], str]] = {
     "image_resolution": (([224, 224],), "224 x 224 images"),
     **_PERIODS,
-    # MEM: neither its images nor, without proprioception, its weights differ from an ordinary policy's
-    "use_visual_memory": ((False,), "policies that see the current images alone"),
-    "use_proprioceptive_memory": ((False,), "policies that read the current state alone"),
 }
 _OF_ALL = {
     *("type", "input_features", "output_features", "use_peft", "chunk_size", "max_state_dim", "max_action_dim"),
@@ -63,6 +60,9 @@ _OF_ALL = {
 _OF_PI = _OF_ALL | {
     *("paligemma_variant", "action_expert_variant", "dtype", "num_inference_steps", "use_relative_actions"),
     *("action_feature_names", "rtc_training_max_delay"),
+    # MEM, of pi05: neither its images nor, without proprioception, its weights differ from an ordinary policy's
+    *("use_visual_memory", "use_proprioceptive_memory"),
+    *("memory_frames", "memory_stride", "memory_temporal_attention_every"),
 }
 _TRAINING = {"freeze_vision_encoder", "train_expert_only", "optimizer_fused", "pretrained_revision"}
 PI = Keys(
@@ -70,10 +70,7 @@ PI = Keys(
     frozenset(
         (FIRST_KEYS - _OF_PI - _OF_PI_NEUTRAL.keys())
         | _TRAINING
-        | {
-            "relative_exclude_joints",  # the preprocessor's own list decides
-            *("memory_frames", "memory_stride", "memory_temporal_attention_every"),  # of memory, which is refused
-        }
+        | {"relative_exclude_joints"}  # the preprocessor's own list decides
     ),
     _OF_PI_NEUTRAL,
 )

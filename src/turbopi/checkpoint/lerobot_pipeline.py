@@ -100,12 +100,13 @@ class Pipelines:
     tokenizer       the folder that the tokenizer's name points to, in the checkpoint, the Hub's cache or elsewhere on
                     this machine. None: it is PaliGemma's, by its name
     notes           what isn't sure about them
+    state_tokens    past states are tokens of their own (MEM): prompts have none, unless the file says so
     state_in_prompt whether prompts have the state: always Pi0.5's of LeRobot to 0.6.1, never Pi0's
     prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
                     0 for Pi0, which writes none
     """
 
-    def __init__(self, folder: Path, kind: Kind = "pi05") -> None:
+    def __init__(self, folder: Path, kind: Kind = "pi05", *, state_tokens: bool = False) -> None:
         self.notes: list[str] = []
         self._paligemma = FAMILIES[kind].paligemma
         self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind)}
@@ -117,8 +118,14 @@ class Pipelines:
         if FAMILIES[kind].state_in_prompt:
             state_step = self.steps[STATE_STEP]
             self.prompt_width = state_step.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
-            self.state_in_prompt = state_step.config.flag("include_state_in_prompt", True)
-            if not self.state_in_prompt:
+            self.state_in_prompt = state_step.config.flag("include_state_in_prompt", not state_tokens)
+            if state_tokens and "include_state_in_prompt" not in state_step.config.values:
+                self.notes.append(
+                    "prompts have no state, as in training with proprioceptive memory. LeRobot doesn't save that, and "
+                    'its own policy writes the state into them: {"discrete_state_input": true} in a turbopi.json does '
+                    "so, too"
+                )
+            elif not self.state_in_prompt:
                 self.notes.append(
                     f"{PREPROCESSOR} says include_state_in_prompt = false: prompts have no state. If the policy was "
                     'trained with it, put {"discrete_state_input": true} into a turbopi.json'

@@ -168,7 +168,7 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
         raise ConfigError(f"{settings.source}: {key} can't be chosen for {family_of(config.model).label}")
     config = config.with_model(**of_model)
     check_real_time(config, settings.source)
-    if config.discrete_state_input and (family := family_of(config.model)).reads_state:
+    if config.discrete_state_input and not (family := family_of(config.model)).state_in_prompt:
         raise ConfigError(
             f"{settings.source}: discrete_state_input is true, but {family.label} reads its state as a number token"
         )

@@ -164,6 +164,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
             *((f"  its {key}", value) for key, value in info.get("observation", {}).items()),
             ("action horizon", f"{info['action_horizon']}, denoising in {denoising(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
+            *([] if info["memory"] is None else [("memory", _memory(info["memory"]))]),
             ("statistics", _statistics_source(info)),
             *_features(info),
             *((f"sizes: {name}", _sizes(sizes)) for name, sizes in info["sizes"].items() if isinstance(sizes, dict)),
@@ -212,6 +213,11 @@ def _state_input(info: dict[str, Any]) -> str:
     if FAMILIES[info["kind"]].reads_state:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
+
+
+def _memory(memory: dict[str, Any]) -> str:
+    parts = [name for name, there in (("images", memory["visual"]), ("states", memory["proprioceptive"])) if there]
+    return f"{' and '.join(parts)} of {memory['frames']} frames, {memory['stride']} observations apart"
 
 
 def _features(info: dict[str, Any]) -> list[tuple[str, str]]:

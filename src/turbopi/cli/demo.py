@@ -120,6 +120,7 @@ class _Run:
         self, options: PolicyOptions, checkpoint: str | None, limit: int | None, seed: int, output: Output
     ) -> None:
         opened = options.open(checkpoint)
+        from turbopi.policy.history import refuse_memory
         from turbopi.policy.policy import UnifiedPolicy
         from turbopi.policy.shipped import load_frames, observations, with_libero_stats
         from turbopi.verify.demo import check, num_oracle_runs, run_frames
@@ -130,6 +131,7 @@ class _Run:
         opened = with_libero_stats(opened)
         policy = options.make_policy(opened, output)
         self.metadata = policy.metadata
+        refuse_memory(self.metadata, "the demo")
         self.robot: str = self.metadata["robot"]
         output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")

@@ -122,6 +122,9 @@ def infer(
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
     policy = options.make_policy(opened, output)
+    if "memory" in policy.metadata:
+        first_one = "the first observation of an episode" if len(sources) == 1 else "one episode, in this order"
+        output.line(f"note: this policy has memory, and takes what it is given as {first_one}", "yellow")
     draw = _noise(model, given_noise, seed, output)
     if warmup:
         if policy.backend.name == "pytorch_compile":

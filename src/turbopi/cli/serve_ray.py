@@ -224,7 +224,13 @@ def _update(
 
 def _open(requested: Requested, checkpoint: str | None, output: Output) -> "Checkpoint":
     """The checkpoint, with what can be said of it before a replica loads it. Raises ConfigError and CheckpointError."""
+    from turbopi.config import memory_of
+
     opened = requested.policy.open(checkpoint)
+    if memory_of(opened.config.model) is not None:
+        raise ConfigError(
+            f"{opened.path} has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
+        )
     anywhere = replace(requested.policy, backend="pytorch", precision=None, device="cpu")  # replicas may run elsewhere
     check_server(replace(requested.server, max_batch=None), anywhere, opened)
     requested.policy.tell_if_random(opened, output)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from turbopi.policy.call_options import MAX_BATCH
+from turbopi.policy.history import refuse_memory
 from turbopi.quantization.formats import named_by
 from turbopi.realtime.messages import PREFIX, message
 from turbopi.realtime.queue import of_batch
@@ -97,6 +98,7 @@ class LocalPolicy:
     def __init__(self, policy: Any, weights: str | None = None, label: str | None = None) -> None:
         """`weights`: the checkpoint's fingerprint, which tells policies apart when a run is continued."""
         about: dict[str, object] = dict(policy.metadata)
+        refuse_memory(about, "an evaluation")
         names = ("config", "backend", "precision", "num_denoising_steps", "robot", "device")
         self._policy, self.about = policy, about
         self.real_time = offered(about)
@@ -202,6 +204,7 @@ class RemotePolicy:
         except PolicyRefused:
             self.close()
             raise
+        refuse_memory(metadata, "an evaluation")
         volatile = ("load_seconds", "backend_details", "backend_reason")
         self.about: dict[str, object] = {"server": self._where, "metadata": metadata}
         self.real_time = offered(metadata)

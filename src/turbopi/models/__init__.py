@@ -5,9 +5,9 @@
 
 import torch
 
-from turbopi.config import PRESETS, Kind, Network, PolicyConfig
+from turbopi.config import PRESETS, Kind, Network, PolicyConfig, memory_of
 from turbopi.models.family import Family
-from turbopi.models.pi0.family import PI0, PI05
+from turbopi.models.pi0.family import PI0, PI05, PI05_STATE_MEMORY, PI05_VISUAL_MEMORY
 from turbopi.models.smolvla.family import BASE, SMOLVLA
 
 FAMILIES: dict[Kind, Family] = {one.kind: one for one in (PI05, PI0, SMOLVLA)}
@@ -16,6 +16,8 @@ RANDOM: dict[str, PolicyConfig] = {**PRESETS, BASE.name: BASE}  # what random we
 
 
 def family_of(config: Network) -> Family:
+    if (memory := memory_of(config)) is not None:
+        return PI05_STATE_MEMORY if memory.proprioceptive else PI05_VISUAL_MEMORY
     return FAMILIES[config.kind]
 
 

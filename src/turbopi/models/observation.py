@@ -1,12 +1,34 @@
 """What goes into the model: the contract between the policy's edges and every backend."""
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from turbopi.config import MemoryConfig
+
+_TENSORS = ("images", "image_mask", "tokens", "token_mask", "state")  # of every policy
+
+
+@dataclass(frozen=True)
+class PastInputs:
+    """What a policy with memory sees besides the current observation, oldest first; None: it doesn't see it.
+
+    F frames, the current one included. False in a mask: the episode hadn't begun, or the camera is missing.
+
+    images      as ModelInputs.images  [C, F - 1, 224, 224, 3]
+    image_mask  bool[C, F - 1]
+    states      float32[F, state_dim]  normalised and zero-padded, the current one last
+    state_mask  bool[F]
+    """
+
+    images: np.ndarray | None = None
+    image_mask: np.ndarray | None = None
+    states: np.ndarray | None = None
+    state_mask: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -18,6 +40,7 @@ class ModelInputs:
     tokens      int64[P]                         prompt ids, padded with 0
     token_mask  bool[P]
     state       float32[action_dim]              normalised and zero-padded; only Pi0 reads it
+    past        for a policy with memory
     """
 
     images: np.ndarray
@@ -25,6 +48,31 @@ class ModelInputs:
     tokens: np.ndarray
     token_mask: np.ndarray
     state: np.ndarray
+    past: PastInputs | None = None
+
+
+@dataclass(frozen=True)
+class Past:
+    """A batch of `PastInputs`, with a leading B axis."""
+
+    images: Tensor | None = None
+    image_mask: Tensor | None = None
+    states: Tensor | None = None
+    state_mask: Tensor | None = None
+
+    @property
+    def parts(self) -> dict[str, Tensor]:
+        """Those that there are, by name."""
+        return {name: part for name, part in vars(self).items() if part is not None}
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Past":
+        return Past(**{name: change(part) for name, part in self.parts.items()})
+
+    def of_cameras(self, mask: Tensor) -> "Past":
+        """Images of some cameras alone: mask bool[C]."""
+        if self.images is None or self.image_mask is None:
+            return self
+        return dataclasses.replace(self, images=self.images[:, mask], image_mask=self.image_mask[:, mask])
 
 
 @dataclass(frozen=True)
@@ -55,26 +103,74 @@ class Observation:
         One on the host stays where it is: its tensors share the memory of its arrays.
         """
 
-        def stacked(name: str) -> Tensor:
-            arrays = [getattr(item, name) for item in inputs]
+        def stacked(arrays: Sequence[np.ndarray]) -> Tensor:
             batch = arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
             tensor = torch.from_numpy(batch)
             return tensor if device == "cpu" else tensor.to(device)
 
-        return cls(*(stacked(name) for name in ("images", "image_mask", "tokens", "token_mask", "state")))
+        tensors = [stacked([getattr(item, name) for item in inputs]) for name in _TENSORS]
+        pasts = [vars(item.past) for item in inputs if item.past is not None]
+        if not pasts:
+            return Observation(*tensors)
+        assert len(pasts) == len(inputs), "some of a batch have a past, others none"
+        there = [name for name, part in pasts[0].items() if part is not None]
+        return PastObservation(*tensors, past=Past(**{name: stacked([one[name] for one in pasts]) for name in there}))
+
+    @classmethod
+    def joined(cls, batches: Sequence["Observation"]) -> "Observation":
+        """All rows of batches without a past."""
+        return Observation(*(torch.cat([getattr(one, name) for one in batches]) for name in _TENSORS))
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Observation":
+        """With each tensor changed."""
+        return Observation(*(change(getattr(self, name)) for name in _TENSORS))
 
     def to(self, device: torch.device | str) -> "Observation":
-        return Observation(
-            self.images.to(device),
-            self.image_mask.to(device),
-            self.tokens.to(device),
-            self.token_mask.to(device),
-            self.state.to(device),
-        )
+        return self.each(lambda part: part.to(device))
+
+    def row(self, row: int) -> "Observation":
+        """One of a batch, as a batch of one."""
+        return self.each(lambda part: part[row : row + 1])
+
+
+@dataclass(frozen=True)
+class PastObservation(Observation):
+    """Of a policy with memory."""
+
+    past: Past = field(kw_only=True)
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> Observation:
+        return PastObservation(*(change(getattr(self, name)) for name in _TENSORS), past=self.past.each(change))
+
+
+def past_of(observation: Observation) -> Past:
+    """What a policy with memory sees besides; nothing for an observation of another."""
+    return observation.past if isinstance(observation, PastObservation) else Past()
+
+
+def remembering(observation: Observation, memory: MemoryConfig) -> PastObservation:
+    """An observation of one row, with a past of zeros, all of it valid."""
+    (_, cameras, *image), frames = observation.images.shape, memory.frames
+    there = observation.image_mask.new_ones
+    parts: dict[str, Tensor] = {}
+    if memory.visual:
+        parts["images"] = observation.images.new_zeros(1, cameras, frames - 1, *image)
+        parts["image_mask"] = there(1, cameras, frames - 1)
+    if memory.proprioceptive:
+        parts["states"] = observation.state.new_zeros(1, frames, memory.state_dim)
+        parts["state_mask"] = there(1, frames)
+    return PastObservation(*(getattr(observation, name) for name in _TENSORS), past=Past(**parts))
 
 
 def with_cameras(inputs: ModelInputs, count: int) -> ModelInputs:
     """The same inputs with `count` valid cameras, the first ones; images that aren't there are black."""
-    images, slots = inputs.images, max(count, len(inputs.image_mask))
-    padded = np.concatenate((images, np.zeros((slots - len(images), *images.shape[1:]), images.dtype)))
-    return dataclasses.replace(inputs, images=padded, image_mask=np.arange(slots) < count)
+    slots, past = max(count, len(inputs.image_mask)), inputs.past
+
+    def padded(of_cameras: np.ndarray) -> np.ndarray:
+        more = slots - len(of_cameras)
+        return np.concatenate((of_cameras, np.zeros((more, *of_cameras.shape[1:]), of_cameras.dtype)))
+
+    if past is not None and past.images is not None and past.image_mask is not None:
+        past = dataclasses.replace(past, images=padded(past.images), image_mask=padded(past.image_mask))
+    mask = np.arange(slots) < count
+    return dataclasses.replace(inputs, images=padded(inputs.images), image_mask=mask, past=past)

@@ -2,13 +2,15 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from turbopi.config import memory_of
 from turbopi.models.observation import ModelInputs, Observation
+from turbopi.policy.history import ObservationHistory
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.support.errors import ObservationError
 
@@ -24,7 +26,9 @@ class Example:
     def bytes(self) -> bytes:
         """All of the model's inputs, to be hashed."""
         parts: list[bytes] = []
-        for name, value in asdict(self.inputs).items():
+        named = asdict(self.inputs)
+        past = named.pop("past") or {}
+        for name, value in [*named.items(), *((f"past {name}", one) for name, one in past.items() if one is not None)]:
             parts += (f"{name} {value.dtype} {list(value.shape)}".encode(), np.ascontiguousarray(value).tobytes())
         return b"".join(parts)
 
@@ -49,13 +53,22 @@ class NoisyExample:
 
 
 def prepared(policy: UnifiedPolicy, named: Iterable[tuple[str, Mapping[str, object]]]) -> Iterator[Example]:
-    """(name, observation) as the model gets them. Raises ObservationError naming the one that can't be used."""
+    """(name, observation) as the model gets them. Raises ObservationError naming the one that can't be used.
+
+    A policy with memory sees those before each one as its past frames, whatever its stride.
+    """
+    memory = memory_of(policy.config.model)
+    history = None if memory is None else ObservationHistory(replace(memory, stride=1))
     for name, observation in named:
         try:
-            inputs, state = policy.pipeline.before(observation)
+            seen = policy.pipeline.see(observation)
+            inputs = policy.pipeline.complete(seen)
         except ObservationError as error:
             raise ObservationError(f"{name}: {error}") from error
-        yield Example(name, inputs, state)
+        if history is not None:
+            history.record(seen.cameras, inputs)
+            inputs = history.with_past(seen.cameras, inputs)
+        yield Example(name, inputs, seen.state)
 
 
 def with_noises(examples: Sequence[Example], shape: tuple[int, int], noises: int, seed: int) -> list[NoisyExample]:

@@ -6,7 +6,7 @@ A backend that can starts on the images first, and prompts are tokenised meanwhi
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,12 @@ import torch
 
 from turbopi import backends
 from turbopi.backends.device_lost import Guard
-from turbopi.models.observation import Observation
+from turbopi.config import memory_of
+from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy.chunk_conditioning import ChunkConditioning, Joins
+from turbopi.policy.history import ObservationHistory, given_frames
 from turbopi.policy.readings import Checks, Reading
-from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.pipeline import Incoming, Pipeline
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class ModelCall:
     ) -> None:
         self._pipeline, self._conditioning, self._backend, self._guard = pipeline, conditioning, backend, guard
         self._checks = checks
+        self._memory = memory_of(pipeline.config.model)
         self.lock = threading.Lock()
 
     def run(
@@ -52,19 +55,46 @@ class ModelCall:
         observations: Sequence[Mapping[str, Any]],
         joins: Joins,
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
+        histories: Sequence[ObservationHistory] = (),  # one for each observation, of a policy with memory
     ) -> Ran:
-        """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        if self._backend.begins:
+        """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good.
+
+        An observation is recorded in its history once all of the call is known to be right.
+        """
+        if self._backend.begins and not self._memory:
             return self._begin(observations, joins, noise)
-        each = [self._pipeline.see(obs) for obs in observations]
-        inputs = Observation.stack([self._pipeline.complete(seen) for seen in each])
+        episodes = [self.see(obs) for obs in observations]
+        each = [frames[-1][0] for frames in episodes]
         states, readings = [seen.state for seen in each], [self._checks.reading(seen) for seen in each]
         x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states)
         requested = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
-            sample = self._backend.sample(inputs, x_1, joins.steps, conditioning=conditioning)
+            of_rows = histories if self._memory else [None] * len(each)
+            inputs = [self.recorded(*one) for one in zip(episodes, of_rows, strict=True)]
+            sample = self._backend.sample(Observation.stack(inputs), x_1, joins.steps, conditioning=conditioning)
             return Ran(sample, states, readings, requested, infer_start, time.perf_counter())
+
+    def see(self, observation: Mapping[str, Any]) -> list[tuple[Incoming, ModelInputs]]:
+        """An observation, the last one, behind the frames that it brings itself."""
+        frames = given_frames(observation, self._memory) if self._memory else None
+        each = map(self._pipeline.see, [observation] if frames is None else frames)
+        inputs = [(seen, self._pipeline.complete(seen)) for seen in each]
+        return inputs if frames is None else [*inputs, inputs[-1]]
+
+    def recorded(
+        self, frames: Sequence[tuple[Incoming, ModelInputs]], history: ObservationHistory | None
+    ) -> ModelInputs:
+        """The model's inputs of what `see` returned, recorded in its history. One that brings its frames isn't."""
+        *past, (seen, inputs) = frames
+        if self._memory is None:
+            return inputs
+        if past:
+            history = ObservationHistory(replace(self._memory, stride=1))
+        assert history is not None
+        for one, its in past or [(seen, inputs)]:
+            history.record(one.cameras, its)
+        return history.with_past(seen.cameras, inputs)
 
     def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
         each = [self._pipeline.see(obs, resize=False) for obs in observations]

@@ -17,7 +17,7 @@ from turbopi.backends.device_lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
-from turbopi.config import PolicyConfig, Solver, TimeGrid
+from turbopi.config import PolicyConfig, Solver, TimeGrid, memory_of
 from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
@@ -34,6 +34,7 @@ from turbopi.policy.call_options import (
     warm_loops,
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
+from turbopi.policy.history import ObservationHistory
 from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
 from turbopi.policy.watch import PolicyWatch
@@ -139,6 +140,8 @@ class UnifiedPolicy:
         self.backend.strict = self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
         self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard, self._checks)
+        self._memory = memory_of(model)
+        self._history = None if self._memory is None else ObservationHistory(self._memory)
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint
@@ -156,6 +159,7 @@ class UnifiedPolicy:
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
         model_actions: bool = False,
+        history: ObservationHistory | None = None,
         readings: bool = False,
     ) -> dict[str, Any]:
         """One observation to one action chunk.
@@ -172,6 +176,7 @@ class UnifiedPolicy:
             conditioning: instead of `previous`, exact instructions to the denoising loop (models/pi0/conditioning.py).
                 One with its own times or solver determines the number of steps.
             model_actions: also return what the next call's `previous` needs.
+            history: where memory records `obs` (docs/lerobot.md). None: the policy's own.
             readings: for a server: what notes are made of, under "reading", instead of them.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
@@ -196,7 +201,8 @@ class UnifiedPolicy:
         own = of_each("conditioning", [conditioning], 1, Conditioning)
         joined = of_each("previous", [previous], 1, RunningChunk)
         requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
-        row = [obs], noises, seed, requested, horizon, own, joined, [model_actions]
+        histories = self._histories([self._history if history is None else history])
+        row = [obs], noises, seed, requested, horizon, own, joined, [model_actions], histories
         return self._infer(*row, hand_over=readings, one_robot=True)[0]
 
     def infer_batch(
@@ -212,13 +218,15 @@ class UnifiedPolicy:
         conditioning: Sequence[Conditioning | None] | None = None,
         previous: Sequence[RunningChunk | None] | None = None,
         model_actions: bool | Sequence[bool] = False,
+        histories: Sequence[ObservationHistory] | None = None,
         readings: bool = False,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
 
         `noise` is [B, H, action_dim]; `seed` is the first row's, the next row has the next number, or one for each row.
         `conditioning` and `previous` have one entry for each row, None for an unconditioned one; `model_actions` is one
-        flag or one for each row. All rows take the same number of denoising steps. Errors name the row.
+        flag or one for each row. All rows take the same number of denoising steps. Memory needs one of
+        `histories` for each row. Errors name the row.
 
         If `runs_batches`, the backend computes 1, 2, 4, 8 or 16 observations together and splits other numbers; else
         one by one, as with another solver than Euler's. Cameras and prompts may differ. Rows with fixed actions,
@@ -234,7 +242,7 @@ class UnifiedPolicy:
             of_each("previous", previous, rows, RunningChunk),
             flags("model_actions", model_actions, rows),
         )
-        several = observations, noise, seed, requested, horizon, own, joined, reported
+        several = observations, noise, seed, requested, horizon, own, joined, reported, self._histories(histories, rows)
         return self._infer(*several, hand_over=readings, one_robot=False)
 
     def _infer(
@@ -247,18 +255,19 @@ class UnifiedPolicy:
         conditionings: Sequence[Conditioning | None],
         previous: Sequence[RunningChunk | None],
         model_actions: Sequence[bool],
+        histories: Sequence[ObservationHistory],
         *,
         hand_over: bool,
         one_robot: bool,
     ) -> list[dict[str, Any]]:
-        """`infer_batch`; the last three before the flags have one for each observation. Flags: `PolicyWatch.report`."""
+        """`infer_batch`; the last four before the flags have one for each observation. Flags: `PolicyWatch.report`."""
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
         joins = self._conditioning.checked(conditionings, previous, steps, actions, denoising.integration)
-        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
+        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed), histories)
         chunks, readings = self._checks.judge(ran.sample.actions.numpy(), ran.readings)
         results = self._pipeline.after_all(chunks, ran.states)
         self._watch.report(results, readings, hand_over=hand_over, one_robot=one_robot)
@@ -323,8 +332,43 @@ class UnifiedPolicy:
         return answer
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before."""
+        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before, memory is empty."""
         self._watch.reset()
+        if self._history is not None:
+            self._history.reset()
+
+    def observe(self, obs: Mapping[str, Any], *, history: ObservationHistory | None = None) -> None:
+        """Record an observation, as `infer` does, without computing. Raises ObservationError without memory."""
+        if self._memory is None:
+            raise ObservationError(f"{self.config.name} has no memory: it sees the observation of `infer` alone")
+        (into,) = self._histories([self._history if history is None else history])
+        frames = self._call.see(obs)
+        if len(frames) > 1:
+            raise ObservationError("this observation brings its past frames, so it is recorded nowhere: give one frame")
+        with self._call.lock:
+            self._call.recorded(frames, into)
+
+    def new_history(self) -> ObservationHistory:
+        """Of another robot. Raises ObservationError without memory."""
+        if self._memory is None:
+            raise ObservationError(f"{self.config.name} has no memory, so it takes no history")
+        return ObservationHistory(self._memory)
+
+    def _histories(
+        self, given: Sequence[ObservationHistory | None] | None, rows: int = 1
+    ) -> Sequence[ObservationHistory]:
+        """One for each row of a policy with memory, none for others. Raises ObservationError."""
+        each = [] if given is None else [one for one in given if one is not None]
+        if self._memory is None:
+            if each:
+                raise ObservationError(f"history was given, but {self.config.name} has no memory: leave it out")
+            return []
+        if not all(isinstance(one, ObservationHistory) for one in each) or len({id(one) for one in each}) != rows:
+            raise ObservationError(
+                f"a policy with memory needs a history for each of {rows} robots, a different one: give `histories`, "
+                "made by `new_history`"
+            )
+        return each
 
     def warmup(
         self,
@@ -355,7 +399,7 @@ class UnifiedPolicy:
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         example = self.example_observation()
-        inputs = self._pipeline.before(example)[0]
+        inputs = self.prepare(example)
         own = int(inputs.image_mask.sum())
         sent = [own, *(getattr(self._pipeline.robot, "camera_counts", None) or ())]  # the example's first
         counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
@@ -386,13 +430,14 @@ class UnifiedPolicy:
 
     def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
         try:
-            self.infer(example, seed=0, num_steps=num_steps, horizon=horizon)
+            history = None if self._memory is None else self.new_history()
+            self.infer(example, seed=0, num_steps=num_steps, horizon=horizon, history=history)
         except ActionError as error:  # of a random observation: whether the weights are at fault, real ones show
             logger.warning("warm-up: %s", error)
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
-        """The model's inputs for an observation. Raises ObservationError if it can't be used."""
-        return self._pipeline.before(obs)[0]
+        """The model's inputs for an episode's first observation. Raises ObservationError if it can't be used."""
+        return self._call.recorded(self._call.see(obs), None if self._memory is None else self.new_history())
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
         """A random observation in this robot's keys, shapes and dtypes."""
@@ -457,6 +502,7 @@ class UnifiedPolicy:
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
             "real_time": {"modes": list(self._conditioning.modes), **dataclasses.asdict(self.config.real_time)},
+            **({} if self._history is None else {"memory": self._history.describe(self._pipeline)}),
             **self._loading,
             **self._pipeline.metadata,
             "features": self._checks.features,

@@ -386,7 +386,7 @@ class Pipeline:
         """Refuse now what would otherwise fail, or go wrong in silence, at the first observation."""
         config, robot, limit = self.config, self.robot, self.config.model.action_dim
         family = family_of(config.model)
-        if config.discrete_state_input and family.reads_state:
+        if config.discrete_state_input and not family.state_in_prompt:
             raise ConfigError(
                 f"{config.name}: only Pi0.5 reads the state from the prompt; {family.label} needs it set to false"
             )

@@ -10,9 +10,11 @@ openpi's own server, too, which offers none of the "rtc" ways.
 """
 
 import ipaddress
+import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -26,6 +28,7 @@ from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.realtime.wire import WireError, pack, unpack
 from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError, TurboPiError
 
+logger = logging.getLogger(__name__)
 _REFUSALS: dict[str, type[TurboPiError]] = {
     "bad request: ": ObservationError,
     "bad observation: ": ObservationError,
@@ -75,6 +78,7 @@ class RealTimeClient:
         self._episode = self._reported = (
             0  # the one now, and the one that a server which keeps the running chunk knows of
         )
+        self._recorded = 0  # observations of this episode, by the last answer of a policy with memory
         _keep_freed_memory()
         with self._lock:
             self.metadata = self._connect(connect_s)
@@ -94,18 +98,26 @@ class RealTimeClient:
         for what can't be sent (such as a tensor), ConfigError if the server doesn't offer what is requested,
         ServerRefused for other answers, and ServerLost.
         """
+        if previous is not None and not isinstance(previous, RunningChunk):
+            raise ObservationError(
+                f"previous is a {type(previous).__name__}; it should be a turbopi.realtime.RunningChunk"
+            )
+        mode = None if previous is None else previous.mode
+        asks = previous is not None or model_actions or seed is not None
+        check = partial(self._check_offered, mode) if asks else None
+        answer = self._answer(message(obs, previous, model_actions, seed), check)
+        return checked_answer(_writable(answer), model_actions=model_actions, batch=f"{PREFIX}batch" in obs)
+
+    def _answer(self, sent: dict[str, Any], check: Callable[[], None] | None) -> dict[str, Any]:
+        """The server's answer to a message. check: of what it offers, once it is connected."""
         with self._lock:
             deadline = time.monotonic() + self._answer_s
             if self._socket is None:
                 self.metadata = self._connect(min(self._connect_s, self._answer_s))
-            if previous is not None and not isinstance(previous, RunningChunk):
-                raise ObservationError(
-                    f"previous is a {type(previous).__name__}; it should be a turbopi.realtime.RunningChunk"
-                )
-            if previous is not None or model_actions or seed is not None:
-                self._check_offered(None if previous is None else previous.mode)
-            sent, reported = message(obs, previous, model_actions, seed), self._reported
-            if reported != self._episode and self._keeps_chunk(sent):
+            if check is not None:
+                check()
+            reported = self._reported
+            if reported != self._episode and (self._keeps_chunk(sent) or "memory" in self.metadata):
                 sent[f"{PREFIX}reset"], reported = True, self._episode
             packed = _packed(sent)
             assert self._socket is not None
@@ -123,10 +135,36 @@ class RealTimeClient:
             if isinstance(reply, str):
                 self._raise(reply)
             answer, self._reported = self._unpacked(reply), reported
-        return checked_answer(_writable(answer), model_actions=model_actions, batch=f"{PREFIX}batch" in obs)
+            self._watch_memory(answer, begins=bool(sent.get(f"{PREFIX}reset")))
+        return answer
+
+    def _watch_memory(self, answer: Mapping[str, Any], begins: bool) -> None:
+        """Warn if the server's history of this robot began anew within an episode, as after a lost connection."""
+        memory = answer.get("memory")
+        if not isinstance(memory, Mapping) or not isinstance(recorded := memory.get("observations"), int):
+            return
+        if not begins and recorded <= self._recorded:
+            logger.warning(
+                "the policy server at %s has forgotten this episode's %d observations: its history began anew",
+                self.url,
+                self._recorded,
+            )
+        self._recorded = recorded
+
+    def observe(self, obs: Mapping[str, Any]) -> dict[str, Any]:
+        """Have the server's policy with memory record an observation: {"observations": of this episode, "missed": …}.
+
+        Raises as `infer`, and ConfigError for a policy without memory.
+        """
+        answer = self._answer({**obs, f"{PREFIX}observe": True}, self._check_remembers)
+        memory = answer.get("memory")
+        if not isinstance(memory, dict):
+            raise ServerRefused(f'the policy server at {self.url} answered an observation without "memory"')
+        return memory
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`: the next chunk joins none of the last one's.
+        """A new episode, as openpi's `BasePolicy.reset`: the next chunk joins none of the last one's, and a policy with
+        memory remembers nothing.
 
         Sends nothing. A server that keeps the running chunk of this client (`turbopi serve --execution`, a session) is
         told with the next request; otherwise there is nothing to forget.
@@ -170,6 +208,10 @@ class RealTimeClient:
         modes = list(offered.get("modes", ()))
         if mode is not None and mode not in modes:
             raise ConfigError(f"the policy server at {self.url} doesn't offer {mode!r}; it offers {modes}")
+
+    def _check_remembers(self) -> None:
+        if "memory" not in self.metadata:
+            raise ConfigError(f"the policy server at {self.url} has no policy with memory: there is nothing to record")
 
     def _keeps_chunk(self, sent: Mapping[str, Any]) -> bool:
         """Whether the server keeps the chunk that this request joins, in a session."""

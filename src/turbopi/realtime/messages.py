@@ -25,7 +25,7 @@ MAX_SEED = 2**64 - 1
 SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot")  # the last: for people
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
-    *("session", "step", "reset", "seed"),
+    *("session", "step", "reset", "seed", "observe"),
     *SCHEDULING_KEYS,
 )
 
@@ -43,6 +43,7 @@ class CallOptions:
     step               actions that the robot has carried out in this session when the observation was taken
     reset              a new episode: the session's running chunk is forgotten
     seed               draws the noise of this call, as `UnifiedPolicy.infer`'s: the same request, the same answer
+    observe            a policy with memory records the observation, and computes nothing
     """
 
     previous: RunningChunk | None = None
@@ -55,6 +56,7 @@ class CallOptions:
     step: int | None = None
     reset: bool = False
     seed: int | None = None
+    observe: bool = False
 
 
 def message(
@@ -128,6 +130,7 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptio
         step=_whole(given, "step", 0),
         reset=_flag(given, "reset"),
         seed=_whole(given, "seed", 0, MAX_SEED),
+        observe=_flag(given, "observe"),
     )
     return observation, options
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.policy.history import refuse_memory
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
@@ -137,6 +138,7 @@ class Replay:
     def __init__(
         self, policy: UnifiedPolicy, dataset: Dataset, episodes: Sequence[Episode], settings: Settings
     ) -> None:
+        refuse_memory(policy.metadata, "a replay")
         self.policy, self.dataset, self.settings = policy, dataset, settings
         self.horizon = policy.config.model.action_horizon
         dataset.wanted = None

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from turbopi.realtime.chunk import checked_answer
 from turbopi.realtime.queue import of_batch
 from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.serve.memory import OBSERVE
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.requests import Result
@@ -39,6 +40,9 @@ class Policy(Protocol):
     measure it on, observations of several clients run together where that is sooner. With `batch_modes`, too, so do
     those that join a chunk in one of these modes: `infer_batch` then takes `previous` and `model_actions`, lists with
     one for each observation.
+
+    With "memory" in its metadata it has `new_history()` and `observe(obs, history=…)`, its `infer` takes `history`, and
+    requests run one by one.
 
     With a true `gives_readings`, all three are given `readings=True`, and their results hold a
     `turbopi.policy.readings.Reading` of the call under "reading", of which the server makes notes.
@@ -81,7 +85,9 @@ class PolicyCalls:
         self._run_numbers = itertools.count()
         lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
         batch_modes = getattr(policy, "batch_modes", ())
-        largest = largest_batch(options, pipelined=self._pipelined, batch_modes=batch_modes, lacking=lacking)
+        remembers = "memory" in policy.metadata
+        of_policy: Any = {"batch_modes": batch_modes, "lacking": lacking, "remembers": remembers}
+        largest = largest_batch(options, pipelined=self._pipelined, **of_policy)
         self.times = BatchTimes(largest)
         self.joining = BatchTimes(self.times.largest if options.execution is not None else 1)
         turns = BatchTimes() if self._pipelined else None
@@ -194,7 +200,7 @@ class PolicyCalls:
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
         request.call = _Call([observation], arguments)
-        request.joins = bool(arguments.keys() - {"seed"})
+        request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
         request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
         results = self.worker.submit(request)
         if self._pipelined and not arguments:
@@ -273,8 +279,15 @@ class PolicyCalls:
         return Ran([[result]], None if result.error else result.seconds)
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
+        if OBSERVE in arguments:
+            observe = partial(self._observe, observation, arguments["history"])
+            return self._result(time.perf_counter(), observe, arguments)
         infer = partial(self._policy.infer, observation, **arguments, **self._readings)
         return self._result(time.perf_counter(), infer, arguments)
+
+    def _observe(self, observation: dict[str, Any], history: Any) -> dict[str, Any]:
+        self._policy.observe(observation, history=history)  # type: ignore[attr-defined]
+        return {}
 
     def _infer_batch(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
@@ -362,14 +375,27 @@ def _sizes(times: BatchTimes) -> list[int]:
 
 
 def largest_batch(
-    options: ServerOptions, *, pipelined: bool, batch_modes: Sequence[str], lacking: Sequence[str] = ()
+    options: ServerOptions,
+    *,
+    pipelined: bool,
+    batch_modes: Sequence[str],
+    lacking: Sequence[str] = (),
+    remembers: bool = False,
 ) -> int:
     """Observations of a batch, at most, as far as measuring allows. Raises ConfigError.
 
     pipelined, batch_modes  the policy's
     lacking                 the methods that batches need and it lacks
+    remembers               it has memory
     """
     requested, execution = options.max_batch, options.execution
+    if remembers:
+        if requested is not None and requested > 1:
+            raise ConfigError(
+                f"max_batch={requested} was asked for, but this policy has memory, and runs requests one by one: leave "
+                "it out"
+            )
+        return 1
     if execution is not None and execution not in batch_modes:
         if requested is not None and requested > 1:
             raise ConfigError(
@@ -387,6 +413,8 @@ def largest_batch(
 
 def _checked(result: Result, answer: Any, arguments: Mapping[str, Any]) -> Result:
     """The result with the answer of an `infer` with these arguments, or with the error if no client may get it."""
+    if OBSERVE in arguments:
+        return replace(result, answer=answer)
     try:
         return replace(result, answer=checked_answer(answer, model_actions=bool(arguments.get("model_actions"))))
     except ActionError as error:

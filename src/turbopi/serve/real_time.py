@@ -62,6 +62,7 @@ class Plan:
     received: float = 0.0
     connection: Hashable = None
     about: dict[str, Any] = field(default_factory=dict)  # what the answer says of it, under "real_time"
+    remembered: Any = None  # serve/memory.py's, of a policy with memory
 
 
 class RealTime:
@@ -86,6 +87,7 @@ class RealTime:
         offered = metadata.get("real_time")
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
+        self._remembers = "memory" in metadata
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         # Those with a chunk, the one that got its chunk last at the end, and those with only a request.
         self._named: OrderedDict[str, _Session] = OrderedDict()
@@ -136,9 +138,11 @@ class RealTime:
         if unconditioned:
             received = {key: value for key, value in received.items() if key != PREFIX + "mode"}
         observation, requested = read_message(received)
+        if requested.observe and not self._remembers:
+            raise ObservationError(f"{PREFIX}observe is for a policy with memory, and this server's has none")
         seeded = _seed(requested)
         if self._joins_nothing(requested, unconditioned) and (self._modes or not seeded):
-            return Plan(observation, seeded, name=requested.session)
+            return Plan(observation, seeded, requested, name=requested.session)
         if not self._modes:
             raise ObservationError(
                 f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
@@ -148,7 +152,7 @@ class RealTime:
         if mode is not None and mode not in self._modes:
             raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
         if requested.session is None and (requested.previous is not None or requested.model_actions):
-            if requested.step is not None or requested.reset:
+            if not self._remembers and (requested.step is not None or requested.reset):
                 raise ObservationError(
                     f"{PREFIX}step and {PREFIX}reset are for sessions, but here the client keeps its running chunk"
                 )
@@ -171,14 +175,24 @@ class RealTime:
 
     def _joins_nothing(self, requested: CallOptions, unconditioned: bool) -> bool:
         """Whether a request needs no chunk. `unconditioned`: its mode is NO_JOINING. Raises ObservationError."""
-        plain = replace(requested, seed=None) == CallOptions(session=requested.session)
+        of_chunk = replace(requested, seed=None, observe=False)
+        if self._remembers:  # these are of its history, too
+            of_chunk = replace(of_chunk, reset=False, step=None)
+        plain = of_chunk == CallOptions(session=requested.session)
+        if requested.observe and not plain:
+            raise ObservationError(
+                f"{PREFIX}observe records an observation and computes no chunk: it goes with {PREFIX}session, "
+                f"{PREFIX}step and {PREFIX}reset alone"
+            )
         if unconditioned and (requested.session is None or not plain):
             raise ObservationError(
                 f"{PREFIX}mode {NO_JOINING!r} joins nothing: it needs {PREFIX}session, and goes with no other key of "
                 "real-time execution"
             )
-        if requested.session is None:
-            return plain and self._options.execution is None
+        if requested.observe:
+            return True
+        if requested.session is None or self._remembers:
+            return unconditioned or (plain and self._options.execution is None)
         return unconditioned or (plain and not self._modes)
 
     def _plan_in_session(

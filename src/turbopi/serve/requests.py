@@ -33,6 +33,7 @@ from turbopi.realtime.messages import (
 )
 from turbopi.realtime.wire import Unpacker, WireError
 from turbopi.serve.connection import GuardedConnection
+from turbopi.serve.memory import Histories
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS, ServerOptions
 from turbopi.serve.real_time import MAX_SESSIONS, Plan, RealTime
@@ -189,6 +190,7 @@ class ClientRequest:
 class RequestHandler:
     """Handles the requests of all clients of one policy. For the event loop's thread alone.
 
+    histories  of the robots, for a policy with memory
     strict    a batch message above the largest batch that was measured is refused instead of split
     why_lost  why no request can be served any more; None while all is well
     """
@@ -201,11 +203,13 @@ class RequestHandler:
         options: ServerOptions,
         max_bytes: int,
         *,
+        histories: Histories | None,
         strict: bool,
         why_lost: Callable[[], str | None],
     ) -> None:
         self._calls, self._real_time, self._metrics, self._options = calls, real_time, metrics, options
         self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
+        self._histories = histories
         self._watches: OrderedDict[str, Watch] = OrderedDict()  # of named sessions, the last used one at the end
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
@@ -253,7 +257,18 @@ class RequestHandler:
         if scheduling.batch is None:
             plan = self._real_time.plan(received, connection)
             connection.robot = connection.robot or plan.name or ""
+            if self._histories is not None:
+                try:
+                    self._histories.begin(plan, connection)
+                except ObservationError:
+                    self._real_time.release(plan)
+                    raise
             return ClientRequest(plan, scheduling, connection, arrived)
+        if self._histories is not None:
+            raise ObservationError(
+                f"{PREFIX}batch came to a policy with memory, which keeps a history of each robot: send the "
+                "observations one by one, each robot's in its own session"
+            )
         check_batch_keys(received, execution=self._options.execution is not None)
         largest = self._calls.largest
         if self._strict and scheduling.batch > largest:
@@ -287,6 +302,8 @@ class RequestHandler:
         finally:
             disconnected.remove_done_callback(cancel)
             self._real_time.release(plan)
+            if self._histories is not None:
+                self._histories.release(plan)
 
     def _note(self, request: ClientRequest, results: Sequence[Result]) -> list[Note]:
         """Put notes in place of the readings of a request's answers. Returns those that the log hasn't said yet."""
@@ -304,7 +321,20 @@ class RequestHandler:
             new += watch.to_log(notes)
             for note in notes:
                 self._metrics.note(note.kind)
+        if self._histories is not None:
+            new += self._remember(request, results[0], watch)
         return new
+
+    def _remember(self, request: ClientRequest, result: Result, watch: Watch) -> list[Note]:
+        """Put what was recorded into a request's answer. Returns what the log hasn't said yet."""
+        assert self._histories is not None and result.answer is not None
+        found, note = self._histories.finish(request.plan, result.answer)
+        result.answer.update(found)
+        if note is None:
+            return []
+        result.answer[NOTES] = [*result.answer.get(NOTES, ()), note.plain]
+        self._metrics.note(note.kind)
+        return watch.to_log([note])
 
     def _watch_of(self, request: ClientRequest) -> Watch:
         """Of the robot: of its session, if that has a name, else of its connection."""

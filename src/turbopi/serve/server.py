@@ -40,6 +40,7 @@ from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
+from turbopi.serve.memory import Histories
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.page.http import is_feed
@@ -95,6 +96,13 @@ class PolicyServer:
             PolicyCalls(policy, options, self.metrics, self._lose) if calls is None else calls(self.metrics, self._lose)
         )
         self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._calls.waits)
+        self._histories = None
+        if "memory" in policy.metadata:
+            if calls is not None:
+                raise ConfigError(
+                    "this policy has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
+                )
+            self._histories = Histories(policy.new_history, policy.metadata["memory"]["bytes"])  # type: ignore[attr-defined]
         self._lost: Future[str] = Future()  # set from the worker's thread
         self._requests = RequestHandler(
             self._calls,
@@ -102,6 +110,7 @@ class PolicyServer:
             self.metrics,
             options,
             self._limits.message_bytes,
+            histories=self._histories,
             strict=bool(policy.metadata.get("strict")),
             why_lost=lambda: self.lost,
         )
@@ -291,6 +300,8 @@ class PolicyServer:
         finally:
             self._idle.discard(connection)
             self._real_time.closed(connection)
+            if self._histories is not None:
+                self._histories.closed(connection)
             self.metrics.clients.dec()
             if self._live is not None:
                 self._live.disconnected(connection, how)
@@ -335,6 +346,9 @@ class PolicyServer:
                 if self._live is not None:
                     self._live.noted(connection, note.kind, note.text)
             previous_total = finished - started  # with the wait for the request, as openpi counts it
+            if "actions" not in result:  # a policy with memory has recorded the observation alone
+                connection.answered("good")
+                continue
             if self._live is not None:
                 assert isinstance(message, bytes)
                 self._live.answered(connection, message, reply, finished - received)

@@ -84,8 +84,9 @@ def _attended(name: str, values: np.ndarray, inputs: ModelInputs) -> np.ndarray:
     if name not in _PER_OBSERVATION or name == "prefix_pad_mask":
         return values
     axis = 2 if name in BY_LAYER else 1  # [L, 1, S, G, K], else [1, S, …]
-    per_image = (values.shape[axis] - len(tokens)) // len(cameras)
-    valid = np.concatenate((cameras.repeat(per_image), tokens))
+    states = np.zeros(0, np.bool_) if inputs.past is None or inputs.past.state_mask is None else inputs.past.state_mask
+    per_image = (values.shape[axis] - len(states) - len(tokens)) // len(cameras)
+    valid = np.concatenate((cameras.repeat(per_image), states, tokens))
     return np.compress(valid, values, axis=axis)
 
 

@@ -51,7 +51,9 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
     arguments = dict(plan.arguments)
     device = backends.resolve_device(arguments["device"])
     precision = arguments["precision"]
-    name = backends.choose(device, precision)[0] if arguments["backend"] == "auto" else arguments["backend"]
+    name = arguments["backend"]
+    if name == "auto":
+        name, _ = backends.choose(device, precision, checkpoint.config.model)
     backends.check(name, device, precision)
     rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)

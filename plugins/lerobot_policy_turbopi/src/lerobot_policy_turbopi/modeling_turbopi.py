@@ -8,6 +8,7 @@ import logging
 import re
 import shutil
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -24,11 +25,12 @@ from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiCon
 from lerobot_policy_turbopi.real_time import Join, read_join
 from lerobot_policy_turbopi.server import PROCESSORS, ServedModel
 from turbopi import UnifiedPolicy, open_checkpoint
+from turbopi.config import memory_of
 from turbopi.models import family_of
-from turbopi.models.observation import Observation
+from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy.call_options import checked_steps
+from turbopi.policy.history import ObservationHistory
 from turbopi.preprocess.images import fit_unit
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 from turbopi.support.reading import file_inside, read_json
 
@@ -56,6 +58,7 @@ class TurboPiPolicy(PreTrainedPolicy):
         self.served = ServedModel(config.server) if config.server is not None else None
         self.turbopi = load(config) if turbopi is None and self.served is None else turbopi
         self._actions: deque[Tensor] = deque()
+        self._histories: list[ObservationHistory] = []  # of each row, with memory
         self.eval()
 
     @classmethod
@@ -131,7 +134,7 @@ class TurboPiPolicy(PreTrainedPolicy):
         if self.served is None:
             inputs = self._inputs(batch)
             join = read_join(self.config, inputs.batch_size, prev_chunk_left_over, inference_delay, execution_horizon)
-            return self._computed(inputs, noise, num_steps, join)
+            return self._computed(inputs, noise, num_steps, join, batch[OBS_LANGUAGE_TOKENS].device)
         if noise is not None or num_steps is not None:
             raise ObservationError("noise and num_steps were given, but the server decides about both: leave them out")
         if OBS_STATE not in batch:
@@ -153,11 +156,16 @@ class TurboPiPolicy(PreTrainedPolicy):
         if not self._actions:
             chunk = self.predict_action_chunk(batch, **options)[:, : self.config.n_action_steps]
             self._actions.extend(chunk.transpose(0, 1))
+        elif self.served is not None:
+            self.served.observe(batch)
+        elif memory_of(self._local.config.model) is not None:
+            self._inputs(batch)  # which records it
         return self._actions.popleft()
 
     def reset(self) -> None:
-        """Forget the rest of the chunk: the next `select_action` looks at its observation."""
+        """Forget the rest of the chunk, and what a policy with memory has seen: a new episode."""
         self._actions.clear()
+        self._histories.clear()
         if self.served is not None:
             self.served.reset()
 
@@ -196,8 +204,9 @@ class TurboPiPolicy(PreTrainedPolicy):
         assert self.turbopi is not None
         return self.turbopi
 
-    def _computed(self, inputs: Observation, noise: Tensor | None, num_steps: int | None, join: Join | None) -> Tensor:
-        device = inputs.tokens.device
+    def _computed(
+        self, inputs: Observation, noise: Tensor | None, num_steps: int | None, join: Join | None, device: torch.device
+    ) -> Tensor:
         shape = (inputs.batch_size, self.config.chunk_size, self.config.max_action_dim)
         if noise is None:
             noise = torch.normal(mean=0.0, std=1.0, size=shape, dtype=torch.float32, device=device)
@@ -220,12 +229,33 @@ class TurboPiPolicy(PreTrainedPolicy):
             if key not in batch:
                 raise ObservationError(f"the batch has no {key!r}; it has {', '.join(batch)}. Preprocess it first")
         tokens, camera_images = batch[OBS_LANGUAGE_TOKENS], self._images(batch)
-        return Observation(
+        inputs = Observation(
             images=camera_images,
             image_mask=torch.ones(camera_images.shape[:2], dtype=torch.bool),  # what is missing isn't sent at all
             tokens=tokens,
             token_mask=batch[OBS_LANGUAGE_ATTENTION_MASK].bool(),
             state=self._state(batch, len(tokens)),
+        )
+        if memory_of(self._local.config.model) is None:
+            return inputs
+        return self._with_past(inputs, [key for key in self.config.image_features if key in batch])
+
+    def _with_past(self, inputs: Observation, cameras: Sequence[str]) -> Observation:
+        """The same, on the host, recorded in each row's history, with what came before. As LeRobot: an entry a call."""
+        host = inputs.to("cpu")
+        each = (host.images, host.image_mask, host.tokens, host.token_mask, host.state)
+        rows = [ModelInputs(*arrays) for arrays in zip(*(part.numpy() for part in each), strict=True)]
+        if not self._histories:
+            self._histories = [self._local.new_history() for _ in rows]
+        if len(rows) != len(self._histories):
+            raise ObservationError(
+                f"the batch has {len(rows)} rows, and those before it {len(self._histories)}: a policy with memory "
+                "keeps a history of each, so call reset() first"
+            )
+        for row, history in zip(rows, self._histories, strict=True):
+            history.record(cameras, row)
+        return Observation.stack(
+            [history.with_past(cameras, row) for row, history in zip(rows, self._histories, strict=True)]
         )
 
     def _images(self, batch: dict[str, Tensor]) -> Tensor:
@@ -239,12 +269,17 @@ class TurboPiPolicy(PreTrainedPolicy):
         size, model = self.config.image_resolution, self._local.config.model
         camera_images = []
         for key in present:
+            if batch[key].ndim != 4:
+                raise ObservationError(
+                    f"{key} has shape {list(batch[key].shape)}; it should be [B, 3, h, w], the current frame: a policy "
+                    "with memory keeps those before it"
+                )
             camera_image = batch[key].to(torch.float32)
             if camera_image.shape[1] == 3:
                 camera_image = camera_image.permute(0, 2, 3, 1)
             if camera_image.shape[1:3] == size:
                 camera_images.append(camera_image * 2 - 1)
-            elif family_of(model).planned:
+            elif family_of(model).paligemma:
                 camera_images.append(resize_with_pad_torch(camera_image, *size) * 2 - 1)
             else:
                 camera_images.append(fit_unit(camera_image, size, self._local.config.image_resize))
@@ -276,7 +311,7 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         )
     checkpoint = open_checkpoint(local_folder(config))
     ours = checkpoint.config
-    if family_of(ours.model).planned:  # the edges are those of the LeRobot that runs, and so is its time grid
+    if family_of(ours.model).paligemma:  # the edges are those of the LeRobot that runs, and so is its time grid
         ours = replace(ours, image_resize="lerobot").with_model(time_grid="multiplied")
     policy = UnifiedPolicy(
         replace(checkpoint, config=ours, named_tokenizer=None),
@@ -285,8 +320,7 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         quantization=config.quantization,
         num_denoising_steps=config.num_inference_steps,
         device=config.device or "auto",
-        # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
-        tokenizer=TINY_TOKENIZER if family_of(ours.model).paligemma else _Words(),
+        tokenizer=_Words(),  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
     )
     described = policy.metadata
     logger.info(

@@ -59,10 +59,15 @@ class ServedModel:
         if len(left_over):
             previous = RunningChunk(left_over, 1, mode=mode, anchor=answer.get("anchor"))
             self._client.infer(observation, previous=previous, model_actions=True)
+        self._client.reset()
 
     def chunk(self, batch: Mapping[str, Any], rows: int, join: Join | None) -> Tensor:
         """float32[B, H, d] in the robot's units, on the CPU. Raises what `RealTimeClient.infer` raises."""
         previous = None if join is None else self._running(join)
+        if self.remembers and rows > 1:
+            raise ObservationError(
+                f"a server's policy with memory takes one robot's observations, but {rows} rows came"
+            )
         chunks = []
         for row in range(rows):
             # with model_actions a server that joins chunks of its own leaves that to this client
@@ -71,6 +76,16 @@ class ServedModel:
             self._answers.append((actions, answer["model_actions"], answer.get("anchor")))
             chunks.append(torch.from_numpy(actions))
         return torch.stack(chunks)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the server's policy has memory."""
+        return "memory" in self._client.metadata
+
+    def observe(self, batch: Mapping[str, Any]) -> None:
+        """Have a policy with memory record an observation whose chunk isn't needed; others aren't sent any."""
+        if self.remembers:
+            self._client.observe(_observation(batch, 0))
 
     def reset(self) -> None:
         """A new episode."""

@@ -194,9 +194,7 @@ class OnnxBackend(Backend):
 
 def _rows(observation: Observation) -> Iterator[Observation]:
     """The observations of a batch, as batches of one."""
-    o = observation
-    for b in range(o.batch_size):
-        yield Observation(*(x[b : b + 1] for x in (o.images, o.image_mask, o.tokens, o.token_mask, o.state)))
+    return map(observation.row, range(observation.batch_size))
 
 
 def _batched(caches: list[KVCache]) -> KVCache:

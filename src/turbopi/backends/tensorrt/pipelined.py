@@ -96,7 +96,7 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
         self.check_conditioning(conditioning)
-        rows = [self.submit(_row(observation, b), noise[b : b + 1], num_steps) for b in range(observation.batch_size)]
+        rows = [self.submit(observation.row(b), noise[b : b + 1], num_steps) for b in range(observation.batch_size)]
         samples = [row.result() for row in rows]
         stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
         return Sample(torch.cat([one.actions for one in samples]), stages)
@@ -175,8 +175,3 @@ def _collect_all(jobs: "SimpleQueue[_Job]") -> None:
 
 def _ends(stages: dict[str, float]) -> dict[str, float]:
     return {name: stages[name] for name in ("vision", "prefix")}
-
-
-def _row(observation: Observation, b: int) -> Observation:
-    o, one = observation, slice(b, b + 1)
-    return Observation(*(x[one] for x in (o.images, o.image_mask, o.tokens, o.token_mask, o.state)))

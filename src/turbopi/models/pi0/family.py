@@ -1,6 +1,9 @@
-"""Pi0.5 and Pi0 as families. Their reference is one, reference.py."""
+"""Pi0.5 and Pi0 as families. Their reference is one, reference.py; Pi0.5 with memory adds memory.py to it."""
+
+from dataclasses import replace
 
 from turbopi.models.family import Family
+from turbopi.models.pi0.memory import MemoryModel
 from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 
 PI05 = Family(
@@ -14,6 +17,8 @@ PI05 = Family(
     state_in_prompt=True,
     prompt_tokens=200,
 )
+PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False)
+PI05_STATE_MEMORY = replace(PI05_VISUAL_MEMORY, state_in_prefix=True)
 PI0 = Family(
     "pi0",
     "Pi0",

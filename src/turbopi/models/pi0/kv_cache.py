@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbopi.models.observation import Observation
+from turbopi.models.observation import Observation, past_of
 
 
 @dataclass(frozen=True)
 class PrefixLayout:
-    """Which of the padded prefix's slots (256 a camera, then the prompt) are computed.
+    """Which of the padded prefix's slots (256 a camera, past states if there is such memory, the prompt) are computed.
 
     `columns` None: all of them, and `mask` says which may be attended to. Otherwise only the slots that some batch
     row needs, and `mask` is None if every row needs them all: always so for B = 1. This compaction is exact,
@@ -25,9 +25,10 @@ class PrefixLayout:
     @classmethod
     def of(cls, observation: Observation, tokens_per_image: int, *, compact: bool) -> "PrefixLayout":
         """The layout of an observation; reading the masks waits for the device."""
-        pad_mask = torch.cat(
-            (observation.image_mask.repeat_interleave(tokens_per_image, dim=1), observation.token_mask), dim=1
-        )
+        state_mask = past_of(observation).state_mask
+        states = () if state_mask is None else (state_mask,)
+        images = observation.image_mask.repeat_interleave(tokens_per_image, dim=1)
+        pad_mask = torch.cat((images, *states, observation.token_mask), dim=1)
         positions = pad_mask.cumsum(1) - 1
         if not compact:
             return cls(pad_mask, positions, None, pad_mask)

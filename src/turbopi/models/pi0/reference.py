@@ -45,6 +45,7 @@ _FLOAT32_ALWAYS = (
     "action_",
     "time_mlp_",
     "state_proj.",
+    "proprio_history_proj.",
     "vlm.norm.",
     "expert.norm.",
 )
@@ -190,14 +191,14 @@ class Pi0Model(nn.Module):
         if not bool((lengths > 0).all()):
             raise ObservationError("an observation without any valid camera or prompt token has nothing to attend to")
         cameras = camera_slots(observation, compact=compact)
-        images = observation.images if cameras is None else observation.images[:, cameras]
-        image_embs, hidden = self.embed_images(images)
+        image_embs, hidden = self.embed_cameras(observation, cameras)
         if cameras is not None:  # back to their slots, from which the layout selects
             count = observation.image_mask.shape[1]
             slots = (cameras[:, None] * per_image + torch.arange(per_image, device=cameras.device)).flatten()
             image_embs = _scatter(image_embs, 1, slots, count * per_image)
             hidden = _scatter(hidden, 0, cameras, count)
-        embs = torch.cat((image_embs, embed_prompt(self.vlm, observation.tokens)), dim=1)
+        prompt = embed_prompt(self.vlm, observation.tokens)
+        embs = torch.cat((image_embs, *self.embed_states(observation), prompt), dim=1)
         embs = embs if layout.columns is None else embs[:, layout.columns]
         if trace is not None:
             trace["vision_last_hidden"] = hidden
@@ -217,6 +218,14 @@ class Pi0Model(nn.Module):
             trace["kv_k"] = layout.to_padded(k, 3).transpose(2, 3)
             trace["kv_v"] = layout.to_padded(v, 3).transpose(2, 3)
         return KVCache(k, v, layout.mask, embedded.lengths, embedded.state)
+
+    def embed_cameras(self, observation: Observation, cameras: Tensor | None) -> tuple[Tensor, Tensor]:
+        """`embed_images` of an observation's, of some cameras alone, by their indices."""
+        return self.embed_images(observation.images if cameras is None else observation.images[:, cameras])
+
+    def embed_states(self, observation: Observation) -> list[Tensor]:
+        """Tokens [B, F, D] between images and prompt: of a policy with proprioceptive memory (memory.py)."""
+        return []
 
     def embed_images(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Images [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W])"""

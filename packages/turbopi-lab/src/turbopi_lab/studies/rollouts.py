@@ -132,8 +132,7 @@ def met(policy: ToyPolicy, episodes: Sequence[int], actor: Actor, calls: int = 4
         return actor(call)
 
     play(policy, episodes, keeping)
-    names = Observation.__dataclass_fields__
-    return Observation(*(torch.cat([getattr(one, name) for one in seen]) for name in names)), torch.cat(noises)
+    return Observation.joined(seen), torch.cat(noises)
 
 
 def seeds_of(episodes: Sequence[int]) -> list[tuple[int, int]]:
