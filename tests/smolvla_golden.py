@@ -1,4 +1,4 @@
-"""LeRobot's golden checkpoints of SmolVLA as its users have them: a folder, and the Hub's cache beside it."""
+"""Golden checkpoints of the other families as their users have them: a folder, and the Hub's cache beside it."""
 
 import json
 import lzma
@@ -14,23 +14,27 @@ GOLDEN = Path(__file__).parent / "golden_smolvla"
 def make_hub(folder: Path) -> Path:
     """A Hub cache with the stand-ins of the vision-language models."""
     for one in (GOLDEN / "hub/HuggingFaceTB").iterdir():
-        repository = folder / f"models--HuggingFaceTB--{one.name}"
-        shutil.copytree(one, repository / "snapshots" / COMMIT)
-        (repository / "refs").mkdir()
-        (repository / "refs/main").write_text(COMMIT)
+        add_to_hub(folder, f"HuggingFaceTB/{one.name}", one)
     return folder
 
 
-def make_checkpoint(name: str, folder: Path) -> Path:
+def add_to_hub(folder: Path, name: str, source: Path) -> None:
+    repository = folder / f"models--{name.replace('/', '--')}"
+    shutil.copytree(source, repository / "snapshots" / COMMIT)
+    (repository / "refs").mkdir()
+    (repository / "refs/main").write_text(COMMIT)
+
+
+def make_checkpoint(name: str, folder: Path, golden: Path = GOLDEN) -> Path:
     """A case's checkpoint with its weights unpacked."""
-    shutil.copytree(GOLDEN / name / "checkpoint", folder)
-    packed = (GOLDEN / name / "model.safetensors.xz").read_bytes()
-    (folder / "model.safetensors").write_bytes(lzma.decompress(packed))
+    shutil.copytree(golden / name / "checkpoint", folder)
+    if (packed := golden / name / "model.safetensors.xz").is_file():
+        (folder / "model.safetensors").write_bytes(lzma.decompress(packed.read_bytes()))
     return folder
 
 
 class GoldenRuns:
-    """A case's observations and what LeRobot computed from them."""
+    """A case's observations and what their owner's code computed from them."""
 
     def __init__(self, name: str, golden: Path = GOLDEN) -> None:
         self.described = json.loads((golden / name / "case.json").read_text())
@@ -52,6 +56,10 @@ class GoldenRuns:
         prefix = f"{self.described['runs'][run]['observation']}/"
         found = {key.removeprefix(prefix): one for key, one in self._inputs.items() if key.startswith(prefix)}
         return {key: str(one.reshape(-1)[0]) if one.dtype.kind == "U" else one for key, one in found.items()}
+
+    def expected(self, run: int) -> dict[str, np.ndarray]:
+        start = f"{run}/"
+        return {key.removeprefix(start): one for key, one in self._expected.items() if key.startswith(start)}
 
     def actions(self, run: int, part: str = "") -> np.ndarray:
         return self._expected[f"{run}/{part}actions"]

@@ -22,9 +22,9 @@ from turbopi.bench.measure import (
     Latency,
     Observations,
     answers,
-    at_horizon,
     bench_policy,
     error_against,
+    for_job,
     measure_calls,
 )
 from turbopi.bench.ready import Start, empty_caches, measure_ready
@@ -142,7 +142,7 @@ def test_a_measurement_ends_early_but_has_its_fewest_calls(policy: UnifiedPolicy
 
 
 def test_another_horizon_shares_the_backend(policy: UnifiedPolicy) -> None:
-    other = at_horizon(policy, 7)
+    other = for_job(policy, Job(horizon=7))
     assert other.backend is policy.backend
     assert answers(other, Job(cameras=1, horizon=7, steps=1), observations=1).shape[:2] == (1, 7)
     assert answers(policy, Job(cameras=1, steps=1), observations=1).shape[:2] == (1, 10)

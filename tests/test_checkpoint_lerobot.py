@@ -139,7 +139,7 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"type": "pi0_fast"}, "of type 'pi0_fast'; Turbo-Pi reads LeRobot's 'pi05' and 'pi0' and 'smolvla'"),
+        ({"type": "act"}, "of type 'act'; Turbo-Pi reads LeRobot's 'pi05' and 'pi0' and 'pi0_fast' and 'smolvla'"),
         ({"type": ["pi0"]}, r"of type \['pi0'\]"),
         ({"image_resolution": [448, 448]}, r"image_resolution = \[448, 448\], which Turbo-Pi doesn't compute"),
         ({"min_period": 0.001}, "min_period = 0.001"),

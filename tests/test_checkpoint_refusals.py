@@ -243,9 +243,9 @@ def test_pickled_weights_and_unmerged_adapters_are_refused(tmp_path: Path) -> No
         open_checkpoint(tmp_path)
 
 
-def test_pi0_fast_is_refused(tmp_path: Path, tree: Tree) -> None:
+def test_pi0_fast_isnt_taken_for_another(tmp_path: Path, tree: Tree) -> None:
     fast = {path: array for path, array in tree.items() if path.startswith("PaliGemma/") and "_1" not in path}
-    with pytest.raises(CheckpointError, match=r"looks like Pi0-FAST.*serve this checkpoint with openpi"):
+    with pytest.raises(ConfigError, match=r"is for pi05, but .* holds pi0_fast weights; presets that fit: pi0_fast"):
         open_checkpoint(jax_copy(tmp_path / "c", fast), "pi05_libero")
 
 

@@ -168,7 +168,7 @@ def test_every_presets_example_goes_through_and_comes_back(name: str) -> None:
     widths = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14), "plain": (32, 32)}[config.robot]
     edges = pipeline(config, *widths)
     inputs, state = edges.before(edges.example(seed=1))
-    size, width = config.planned_model.vision.image_size, config.planned_model.action_dim
+    size, width = config.model.image_size, config.model.action_dim
     actions = edges.after(np.zeros((config.model.action_horizon, width), np.float32), state)["actions"]
     tokens = config.model.max_prompt_tokens
     expected: list[tuple[np.ndarray, tuple[int, ...], type]] = [
@@ -177,7 +177,7 @@ def test_every_presets_example_goes_through_and_comes_back(name: str) -> None:
         (inputs.tokens, (tokens,), np.int64),
         (inputs.token_mask, (tokens,), np.bool_),
         (inputs.state, (width,), np.float32),
-        (state, (width,), np.float64),
+        (state, (max(width, widths[0]),), np.float64),
         (actions, (config.model.action_horizon, widths[1]), np.float64),
     ]
     for array, shape, dtype in expected:

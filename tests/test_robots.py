@@ -431,7 +431,7 @@ def test_every_presets_robot_can_be_made() -> None:
     [
         ("libro", {}, "unknown robot 'libro'; choose one of libero, droid, aloha, lerobot, plain"),
         ("os:system", {}, "robots in Python code are given as objects"),
-        ("droid", {"delta": True}, "robot droid has no option delta; it has none"),
+        ("droid", {"delta": True}, "robot droid has no option delta; it has wrist_last"),
         ("aloha", {"adapt": True}, "robot aloha has no option adapt; it has adapt_to_pi, delta_actions"),
         ("lerobot", {"state_dim": 3}, "robot lerobot needs the option image_keys, action_dim"),
         ("absent.json", {}, r"absent\.json can't be read: No such file"),

@@ -16,7 +16,7 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.reading import is_finite, is_integer, shown
 
 PiKind = Literal["pi05", "pi0"]
-Kind = Literal["pi05", "pi0", "smolvla"]
+Kind = Literal["pi05", "pi0", "pi0_fast", "smolvla"]
 FloatPrecision = Literal["bf16", "f32"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 
@@ -26,6 +26,7 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
     "action_horizon": 1000,
     "action_dim": 1024,
     "max_prompt_tokens": 8192,
+    "max_decoding_steps": 1000,
     "num_denoising_steps": 1000,
     "vocab_size": 2**24,
     "depth": 256,
@@ -45,6 +46,9 @@ MOST_REMEMBERED = 2048  # observations of an episode that a policy with memory k
 
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4", "lerobot_smolvla"]  # how, see preprocess/images.py
+MissingCameras = Literal["masked", "black"]  # what the model sees of a camera that an observation lacks
+BrokenAnswers = Literal["refuse", "owners", "unread"]
+Owner = Literal["openpi", "lerobot"]
 Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: models/pi0/conditioning.py
 Solver = Literal[
     "euler", "midpoint", "heun", "ab2", "exponential"
@@ -125,6 +129,8 @@ class Network(Protocol):
     @property
     def kind(self) -> Kind: ...
     @property
+    def vision(self) -> VisionConfig: ...
+    @property
     def image_size(self) -> int: ...
     @property
     def state_dim(self) -> int: ...
@@ -182,10 +188,7 @@ class ModelConfig:
             ours, theirs = getattr(self.vlm, attribute), getattr(self.expert, attribute)
             if ours != theirs:
                 raise ConfigError(f"vlm and expert share one attention, but {attribute} is {ours} and {theirs}")
-        if self.vision.width % self.vision.num_heads:
-            raise ConfigError(f"vision width {self.vision.width} isn't a multiple of {self.vision.num_heads} heads")
-        if self.vlm.num_heads % self.vlm.num_kv_heads:
-            raise ConfigError(f"{self.vlm.num_heads} query heads don't divide by {self.vlm.num_kv_heads} KV heads")
+        _check_heads(self.vision, self.vlm)
         if self.expert.head_dim % 2 or self.expert.width % 2:
             raise ConfigError("RoPE and the time embedding need an even head_dim and an even expert width")
         if self.memory is not None:
@@ -213,7 +216,60 @@ def memory_of(model: Network) -> MemoryConfig | None:
     return model.memory if isinstance(model, ModelConfig) else None
 
 
-def _check_sizes(name: str, part: ModelConfig | VisionConfig | GemmaConfig | MemoryConfig) -> None:
+@dataclass(frozen=True)
+class Pi0FastConfig:
+    """The network of a Pi0-FAST, and how its answers are read.
+
+    owner               whose rules hold: openpi's or LeRobot's
+    action_dim          of the robot: an answer has action_horizon * action_dim coefficients
+    max_decoding_steps  tokens of an answer at most
+    skipped_ids         at the end of the vocabulary, which no action token uses (fast_skip_tokens)
+    checks_prefix       LeRobot's validate_action_token_prefix
+    broken_answers      "refuse": an ActionError; "owners": what the owner's own code makes of them; "unread": answers
+                        are as long as they may be, and stand-in actions are made of their ids, for measurements
+    """
+
+    owner: Owner = "openpi"
+    vision: VisionConfig = VisionConfig()
+    vlm: GemmaConfig = GemmaConfig(width=2048, mlp_dim=16384)
+    vocab_size: int = 257_152
+    action_dim: int = 32
+    action_horizon: int = 32
+    max_prompt_tokens: int = 250
+    max_decoding_steps: int = 256
+    skipped_ids: int = 128
+    checks_prefix: bool = True
+    broken_answers: BrokenAnswers = "refuse"
+    rms_norm_eps: float = 1e-6
+    rope_base: float = 10_000.0
+
+    kind: ClassVar[Kind] = "pi0_fast"
+    time_grid: ClassVar[TimeRounding] = "multiplied"
+
+    @property
+    def image_size(self) -> int:
+        return self.vision.image_size
+
+    @property
+    def state_dim(self) -> int:
+        """The prompt alone has the state, of any width."""
+        return self.action_dim
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
+        for name, part in (("", self), ("vision ", self.vision), ("vlm ", self.vlm)):
+            _check_sizes(name, part)
+        _check_heads(self.vision, self.vlm)
+
+
+def _check_heads(vision: VisionConfig, vlm: GemmaConfig) -> None:
+    if vision.width % vision.num_heads:
+        raise ConfigError(f"vision width {vision.width} isn't a multiple of {vision.num_heads} heads")
+    if vlm.num_heads % vlm.num_kv_heads:
+        raise ConfigError(f"{vlm.num_heads} query heads don't divide by {vlm.num_kv_heads} KV heads")
+
+
+def _check_sizes(name: str, part: ModelConfig | Pi0FastConfig | VisionConfig | GemmaConfig | MemoryConfig) -> None:
     for one in dataclasses.fields(part):
         value, limit = getattr(part, one.name), LIMITS.get(one.name)
         if limit is not None and not (is_integer(value) and 1 <= value <= limit):
@@ -272,6 +328,7 @@ class PolicyConfig:
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
     real_time: RealTime = RealTime()
+    missing_cameras: MissingCameras = "masked"  # "black": seen as black images, as by openpi's Pi0-FAST
     prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so
 
     @property
@@ -304,6 +361,7 @@ _TINY = ModelConfig(
     action_horizon=10,
 )
 _ZSCORE = Normalization("zscore", "zscore")
+_LIBERO_FAST = Pi0FastConfig(action_dim=7, action_horizon=10, max_prompt_tokens=180)
 
 
 def _model(base: ModelConfig, horizon: int) -> ModelConfig:
@@ -340,6 +398,30 @@ _PRESETS = (
         robot_options={"delta_actions": True},  # unlike pi05_libero, trained on actions relative to the state
     ),
     PolicyConfig("pi0_droid", _model(_PI0, 10), "droid", _ZSCORE, discrete_state_input=False, asset_id="droid"),
+    PolicyConfig("pi0_fast_base", Pi0FastConfig(), "plain", missing_cameras="black"),
+    PolicyConfig(
+        "pi0_fast_libero",
+        _LIBERO_FAST,
+        "libero",
+        asset_id="physical-intelligence/libero",
+        robot_options={"delta_actions": True},
+        missing_cameras="black",
+    ),
+    PolicyConfig(
+        "pi0_fast_droid",
+        Pi0FastConfig(action_dim=8, action_horizon=10),
+        "droid",
+        asset_id="droid",
+        robot_options={"wrist_last": True},
+        missing_cameras="black",
+    ),
+    PolicyConfig(
+        "pi0_fast_tiny",
+        dataclasses.replace(_LIBERO_FAST, vision=_TINY.vision, vlm=_TINY.vlm, vocab_size=1024, max_decoding_steps=24),
+        "libero",
+        asset_id="physical-intelligence/libero",
+        missing_cameras="black",
+    ),
     PolicyConfig(
         "pi0_aloha",
         _PI0,

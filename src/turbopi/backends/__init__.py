@@ -46,6 +46,7 @@ class BackendSpec:
 
     extension  of another distribution's
     unplanned  "module:class" that runs under this name what the engine has no plan for
+    tokens     "module:class" that runs under this name models that write their actions as tokens
     """
 
     name: str
@@ -54,10 +55,17 @@ class BackendSpec:
     summary: str
     extension: extensions.Extension | None = None
     unplanned: str | None = None
+    tokens: str | None = None
 
 
 _SPECS = (
-    BackendSpec("pytorch", "turbopi.backends.pytorch", "PyTorchBackend", "the reference, eager: any device"),
+    BackendSpec(
+        "pytorch",
+        "turbopi.backends.pytorch",
+        "PyTorchBackend",
+        "the reference, eager: any device",
+        tokens="turbopi.backends.tokens:TokensBackend",
+    ),
     BackendSpec(
         "pytorch_compile",
         "turbopi.backends.pytorch_compile",
@@ -70,6 +78,7 @@ _SPECS = (
         "CudaGraphBackend",
         "the whole call in CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
         unplanned="turbopi.backends.captured:CapturedBackend",
+        tokens="turbopi.backends.tokens:CapturedTokensBackend",
     ),
     BackendSpec(
         "fused",
@@ -279,11 +288,16 @@ def class_of(name: str) -> type[Backend]:
 
 
 def class_for(name: str, config: Network) -> type[Backend]:
-    """`class_of`, or the one that runs under that name what the engine has no plan for."""
+    """`class_of`, or the one that runs under that name what the engine has no plan for, or what writes tokens."""
     spec, cls = BACKENDS.get(name), class_of(name)
-    if cls.refuses_model(config) is None or spec is None or spec.unplanned is None:
+    if spec is None:
         return cls
-    module, _, other = spec.unplanned.partition(":")
+    place = spec.unplanned if cls.refuses_model(config) is not None else None
+    if family_of(config).reader is not None:
+        place = spec.tokens
+    if place is None:
+        return cls
+    module, _, other = place.partition(":")
     found: type[Backend] = getattr(importlib.import_module(module), other)
     return found
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from turbopi.checkpoint.base import Room
 from turbopi.config import FloatPrecision, ImageResize, Network
 from turbopi.models import family_of
+from turbopi.models.family import AnswerReader
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
@@ -65,6 +66,7 @@ class Backend(ABC):
     submits         whether it has `submit`: several observations may be in flight
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
+    reader          of a model that writes its actions as tokens: what makes actions of them. Set by the policy
     """
 
     name: ClassVar[str]
@@ -75,6 +77,7 @@ class Backend(ABC):
     runs_batches: ClassVar[bool] = False
     submits: ClassVar[bool] = False
     strict = False
+    reader: AnswerReader | None = None
 
     config: Any  # a Network; a backend that plans says `ModelConfig`
 

@@ -22,7 +22,7 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.config import ImageResize, memory_of
-from turbopi.engine.graph import Graph, building
+from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.plan import cold_call
 from turbopi.engine.resize import Resizer
 from turbopi.models.observation import Observation, Past, PastObservation, past_of, remembering
@@ -76,6 +76,15 @@ class Graphs:
     loops: dict[tuple[int, int], Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """A captured vision: what resizes bytes in it (None: nothing does), and the embedded images that it writes."""
+
+    resizer: Resizer | None
+    graph: Graph
+    embedded: Tensor
+
+
 class CapturedBackend(PyTorchBackend):
     """The reference of a family, its stages through torch.compile where there is a compiler, in CUDA graphs."""
 
@@ -100,8 +109,7 @@ class CapturedBackend(PyTorchBackend):
         self._times: dict[bytes, Tensor] = {}
         self._turn: object = None  # of the observation whose images are in the inputs
         self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
-        stages = (self._stages.embed_images, self._prefix_stage, self._stages.velocity)
-        self._embed_images, self._prefix_of, self._velocity = map(self._stage, stages)
+        self._embed_images, self._prefix_of, self._velocity = map(self._stage, self._to_compile)
 
     def warmup(
         self,
@@ -245,7 +253,11 @@ class CapturedBackend(PyTorchBackend):
     def _stage(self, stage: Callable[..., Any]) -> Callable[..., Any]:
         return compile_stage(stage, dynamic=False) if self._compiles else stage
 
-    def _vision(self, observation: Observation, mark: Callable[[str], None]) -> Tensor:
+    @property
+    def _to_compile(self) -> tuple[Callable[..., Any], ...]:
+        return self._stages.embed_images, self._prefix_stage, self._stages.velocity
+
+    def _vision(self, observation: Observation, mark: Mark) -> Tensor:
         return self._embed_images(observation if isinstance(observation, PastObservation) else observation.images[0])
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, Any]:
@@ -260,23 +272,36 @@ class CapturedBackend(PyTorchBackend):
                 self._graphs[cameras] = self._capture(cameras)
         return self._graphs[cameras]
 
-    def _capture(self, cameras: int) -> Graphs:
+    def _inputs(self, cameras: int) -> Observation:
         config, side, prompt = self.config, self.config.image_size, self.config.max_prompt_tokens
-        inputs = Observation(
+        return Observation(
             torch.zeros(1, cameras, side, side, 3),
             torch.ones(1, cameras, dtype=torch.bool),
             torch.zeros(1, prompt, dtype=torch.int64),
             torch.ones(1, prompt, dtype=torch.bool),
             torch.zeros(1, config.state_dim),
         ).to(self.device)
-        if (memory := memory_of(config)) is not None:
+
+    def _capture(self, cameras: int) -> Graphs:
+        inputs = self._inputs(cameras)
+        if (memory := memory_of(self.config)) is not None:
             inputs = remembering(inputs, memory)
-        images: list[Tensor] = []
+        seen = self._seen(inputs)
         left: list[tuple[KVCache, Any, Any]] = []
 
-        resizer = Resizer(inputs.images[0]) if self._compiles else None  # Triton's kernel needs a compiler, too
+        def prefix(mark: Mark) -> None:
+            left[:] = [self._prefix_of(inputs, seen.embedded)]
+            mark("prefix")
 
-        def vision(mark: Callable[[str], None]) -> None:
+        second = Graph(prefix, self._pool, self._stream)
+        return Graphs(inputs, seen.resizer, seen.graph, second, *left[0])
+
+    def _seen(self, inputs: Observation) -> Seen:
+        """The captured vision of an observation that lies in `inputs`."""
+        resizer = Resizer(inputs.images[0]) if self._compiles else None  # Triton's kernel needs a compiler, too
+        images: list[Tensor] = []
+
+        def vision(mark: Mark) -> None:
             if resizer is not None:
                 from turbopi.kernels.portable.resize import resize_images
 
@@ -284,13 +309,8 @@ class CapturedBackend(PyTorchBackend):
             images[:] = [self._vision(inputs, mark)]
             mark("vision")
 
-        def prefix(mark: Callable[[str], None]) -> None:
-            left[:] = [self._prefix_of(inputs, images[0])]
-            mark("prefix")
-
-        first = Graph(vision, self._pool, self._stream)
-        second = Graph(prefix, self._pool, self._stream)
-        return Graphs(inputs, resizer, first, second, *left[0])
+        graph = Graph(vision, self._pool, self._stream)
+        return Seen(resizer, graph, images[0])
 
     def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> _Step:
         if (horizon, by_action) not in graphs.steps:
@@ -299,7 +319,7 @@ class CapturedBackend(PyTorchBackend):
             time = time[:, None].repeat(1, horizon, 1) if by_action else time.clone()
             made: list[Tensor] = []
 
-            def step(mark: Callable[[str], None]) -> None:
+            def step(mark: Mark) -> None:
                 made[:] = self._velocity(x, time, graphs.cache, graphs.behind)
                 mark("denoise")
 

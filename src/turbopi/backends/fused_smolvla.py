@@ -3,7 +3,6 @@
 Steps of a conditioned call, which that kernel doesn't take, run as in `cuda_graph`: the reference's, captured.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,7 +15,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tuned_tiles import tiles_of
 from turbopi.config import Network
 from turbopi.engine import smolvla
-from turbopi.engine.graph import HEAD, Graph, building
+from turbopi.engine.graph import HEAD, Graph, Mark, building
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
 from turbopi.models.observation import Observation
@@ -93,7 +92,7 @@ class FusedSmolVLABackend(CapturedBackend):
         made = {"operations": dict(self._origin), "tiles": self._tiles.about, "denoising": denoising}
         return super().describe() | made
 
-    def _vision(self, observation: Observation, mark: Callable[[str], None]) -> Tensor:
+    def _vision(self, observation: Observation, mark: Mark) -> Tensor:
         return self._tower(observation.images[0], lambda: mark(HEAD))
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, _Attended]:
@@ -139,7 +138,7 @@ class FusedSmolVLABackend(CapturedBackend):
             with building(self.device), torch.no_grad():
                 kernel = self._expert.denoiser(num_steps, cache_rows=rows, suffix=horizon, device=self.device)
 
-                def run(mark: Callable[[str], None]) -> None:
+                def run(mark: Mark) -> None:
                     kernel.launch(noise, attended.keys, attended.values, attended.length, x_t, v_t)
                     mark("denoise")
 

@@ -14,7 +14,8 @@ from turbopi.backends import Precision
 from turbopi.bench.document import PolicyError, Times
 from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
-from turbopi.config import CAMERAS, Normalization, Solver, TimeGrid
+from turbopi.config import CAMERAS, Normalization, PolicyConfig, Solver, TimeGrid
+from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
@@ -43,24 +44,33 @@ def bench_policy(
     robot: str | Robot | None = None,
     solver: Solver | None = None,
     time_grid: TimeGrid | None = None,
+    most_steps: int | None = None,
 ) -> UnifiedPolicy:
     """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
 
     The state stays out of the prompt and nothing is normalised: actions are the model's own. With a `robot` all of
-    that is the robot's, and the job has to have its cameras (`robots_job`).
+    that is the robot's, and the job has to have its cameras (`robots_job`). Where the model writes its actions as
+    tokens, a job's steps are tokens of each answer, whatever it says: at most `most_steps` of all jobs.
     """
     config = checkpoint.config
     if robot is None:
         identity = Normalization("identity", "identity")
         config = dataclasses.replace(
-            config, robot="plain", robot_options={}, discrete_state_input=False, normalization=identity
+            config,
+            robot="plain",
+            robot_options={},
+            discrete_state_input=False,
+            normalization=identity,
+            missing_cameras="masked",
         )
     config = config.with_model(action_horizon=job.horizon)
+    if tokens := writes_tokens(config):
+        config = config.with_model(broken_answers="unread", max_decoding_steps=most_steps or job.steps)
     return UnifiedPolicy(
         dataclasses.replace(checkpoint, config=config),
         backend=backend,
         precision=precision,
-        num_denoising_steps=job.steps,
+        num_denoising_steps=None if tokens else job.steps,
         solver=solver,
         time_grid=time_grid,
         device=device,
@@ -83,11 +93,19 @@ def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None
     )
 
 
-def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
-    """The same policy, weights and captured graphs with another number of actions in a chunk."""
+def for_job(policy: UnifiedPolicy, job: Job) -> UnifiedPolicy:
+    """The same policy, weights and captured graphs with the job's number of actions in a chunk; of a model that writes
+    its actions as tokens, with its number of tokens.
+    """
+    if writes_tokens(policy.config):
+        return policy.writing(job.steps)
     other = copy.copy(policy)
-    other.config = policy.config.with_model(action_horizon=horizon)
+    other.config = policy.config.with_model(action_horizon=job.horizon)
     return other
+
+
+def writes_tokens(config: PolicyConfig) -> bool:
+    return family_of(config.model).reader is not None
 
 
 def conditioning(policy: UnifiedPolicy, job: Job) -> Conditioning | None:
@@ -138,10 +156,10 @@ class Observations:
 
     def _prompt(self, tokens: int) -> str:
         """A random prompt of exactly that many tokens; `bench_policy` keeps the state out of it."""
-        tokenizer = self._policy.pipeline.tokenizer
+        pipeline = self._policy.pipeline
         for _ in range(100):
             words: list[str] = []
-            while (count := len(tokenizer.encode(" ".join(words)))) < tokens:
+            while (count := len(pipeline.tokenizer.encode(" ".join(words), write=pipeline.write))) < tokens:
                 more = max(1, (tokens - count) // 8)  # a word takes fewer than eight tokens, or the next try finds one
                 words += map(str, self._rng.choice(WORDS, more))
             if count == tokens:
@@ -225,7 +243,9 @@ def answers(policy: UnifiedPolicy, job: Job, *, observations: int = 4) -> np.nda
     for seed in range(observations):
         noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
         requested = conditioning(policy, job)
-        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps, conditioning=requested)["actions"])
+        given: dict[str, Any] = {} if writes_tokens(policy.config) else {"noise": noise}
+        answer = policy.infer(next(source), num_steps=job.steps, conditioning=requested, **given)
+        chunks.append(answer["actions"])
     return np.stack(chunks)
 
 

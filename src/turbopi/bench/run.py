@@ -17,10 +17,10 @@ from turbopi.bench.measure import (
     WARMING,
     Observations,
     answers,
-    at_horizon,
     bench_policy,
     call,
     error_against,
+    for_job,
     measure_calls,
 )
 from turbopi.bench.profile import stage_kernels, start_profiler
@@ -217,7 +217,7 @@ def _measure(
     results = []
     for job in jobs:
         progress.doing(f"{backend} {precision}: {job}")
-        shaped = at_horizon(policy, job.horizon)
+        shaped = for_job(policy, job)
         first = call(shaped, job, Observations(shaped, job, seed=2))["total_ms"]
         latency = measure_calls(
             shaped, job, plan.calls_of(backend, job), seconds=plan.seconds, advance=progress.advance
@@ -251,7 +251,7 @@ def _judged(
 ) -> list[Result]:
     """The results with their errors against the float32 reference, where it was asked. It answers each job once."""
     oracle = _policy(checkpoint, plan, "pytorch", "f32", device)
-    exact = {job: answers(at_horizon(oracle, job.horizon), job) for job in dict.fromkeys(key[2] for key in answered)}
+    exact = {job: answers(for_job(oracle, job), job) for job in dict.fromkeys(key[2] for key in answered)}
     del oracle
     collect_and_empty_cache()
 
@@ -288,7 +288,7 @@ def _profile(
     progress.doing(f"{backend} {precision}: profile")
     start_profiler(device)
     policy = _policy(checkpoint, plan, backend, precision, device)
-    stages = stage_kernels(policy, plan.main)
+    stages = stage_kernels(for_job(policy, plan.main), plan.main)
     del policy
     collect_and_empty_cache()
     return Profile(backend, precision, plan.main, stages)
@@ -310,7 +310,7 @@ def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Work]:
 def _policy(
     checkpoint: Checkpoint, plan: BenchPlan, backend: str, precision: Precision, device: torch.device
 ) -> UnifiedPolicy:
-    """A policy that runs any job of the plan with `at_horizon`."""
+    """A policy that runs any job of the plan with `for_job`."""
     return bench_policy(
         checkpoint,
         backend,
@@ -322,6 +322,7 @@ def _policy(
         robot=plan.robot,
         solver=plan.solver,
         time_grid=plan.time_grid,
+        most_steps=max(plan.steps),
     )
 
 

@@ -66,6 +66,8 @@ class Checkpoint:
     asset_id: str | None = None
     tokenizer_candidates: tuple[Path, ...] = ()
     named_tokenizer: Path | None = None  # the folder that LeRobot's processors name, if it is here
+    action_tokenizers: tuple[Path, ...] = ()  # folders that it may be in, of models that write their actions as tokens
+    action_tokenizer_name: str | None = None  # its repository on the Hub
     expected_sha256: str | None = None  # what the configuration says the weights' hash is
 
     @property
@@ -87,6 +89,21 @@ class Checkpoint:
         key = self._files_key()
         found = None if key is None else known_hashes.look_up(key)
         return None if found is None else found[:12]
+
+    @property
+    def _loop(self) -> dict[str, Any]:
+        """What makes actions: denoising, or tokens."""
+        config = self.config
+        if family_of(config.model).reader is not None:
+            return {
+                "max_decoding_steps": getattr(config.model, "max_decoding_steps", None),
+                "action_tokenizers": [str(folder) for folder in self.action_tokenizers if folder.is_dir()],
+            }
+        return {
+            "num_denoising_steps": config.num_denoising_steps,
+            "solver": config.solver,
+            "time_grid": config.solver_grid,
+        }
 
     @property
     def _named_tokenizer(self) -> list[Path]:
@@ -185,9 +202,7 @@ class Checkpoint:
             "config_source": self.config_source,
             "robot": self.config.robot,
             "action_horizon": self.config.model.action_horizon,
-            "num_denoising_steps": self.config.num_denoising_steps,
-            "solver": self.config.solver,
-            "time_grid": self.config.solver_grid,
+            **self._loop,
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
             "memory": None if (memory := memory_of(self.config.model)) is None else asdict(memory),

@@ -10,7 +10,7 @@ from pathlib import Path
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read_settings, values_of
 from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import WeightSource, listing
-from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig
+from turbopi.config import GemmaConfig, PolicyConfig
 from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import read_json, shown
@@ -39,9 +39,9 @@ def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfi
             "max_token_len": policy.model.max_prompt_tokens,
             "discrete_state_input": policy.discrete_state_input,
             "pi05": family_of(policy.model).modulated,
-            "paligemma_variant": policy.planned_model.vlm,
-            "action_expert_variant": policy.planned_model.expert,
         }
+        stacks = {"paligemma_variant": "vlm", "action_expert_variant": "expert"}
+        facts |= {key: getattr(policy.model, name) for key, name in stacks.items() if hasattr(policy.model, name)}
     others = [
         f"{key} = {shown(said[key])} (used: {_readable(fact)})"
         for key, fact in facts.items()
@@ -83,7 +83,7 @@ def notes_on_settings(
         for key, value in theirs.items()
         if key != "name" and value != ours[key]
     ]
-    heads = {"vision_heads": policy.model.vision.num_heads} if isinstance(policy.model, ModelConfig) else {}
+    heads = {"vision_heads": policy.model.vision.num_heads}
     others += [
         f"{key} = {shown(value)}"
         for key, value in beside.values.items()

@@ -245,7 +245,7 @@ _ELSEWHERE = {"model", "vision", "vlm", "expert", "robot", "asset_id", "vocab_si
 
 
 def _is_preset(config: PolicyConfig) -> bool:
-    return config.name in PRESETS and PRESETS[config.name].planned_model.kind == config.planned_model.kind
+    return config.name in PRESETS and PRESETS[config.name].model.kind == config.model.kind
 
 
 def _write_json(file: Path, content: dict[str, object]) -> None:

@@ -154,11 +154,7 @@ class LeRobotFolder:
         notes = []
         if unknown := self.keys.unknown(self.config.values):
             notes.append(f"{CONFIG} has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}")
-        if self._rtc_config is not None:
-            what = "enables rtc_config: `infer(previous=…)` takes its schedule, weight and horizon where it has none"
-            if self._rtc_config.choice("mode", ("guided", "trained"), default="guided") == "trained":
-                what = 'says mode "trained": give `infer` a running chunk of mode "rtc_trained"'
-            notes.append(f"{CONFIG} {what} (docs/real_time.md); a call without one is an ordinary one")
+        notes += self._notes_on_rtc()
         notes += self.pipelines.notes
         if self.settings.policy is not None:
             return notes
@@ -185,6 +181,23 @@ class LeRobotFolder:
                 "otherwise: they are followed, as by LeRobot"
             )
         return notes
+
+    def _notes_on_rtc(self) -> list[str]:
+        if self._rtc_config is None:
+            return []
+        what = "enables rtc_config: `infer(previous=…)` takes its schedule, weight and horizon where it has none"
+        if self._rtc_config.choice("mode", ("guided", "trained"), default="guided") == "trained":
+            what = 'says mode "trained": give `infer` a running chunk of mode "rtc_trained"'
+        return [f"{CONFIG} {what} (docs/real_time.md); a call without one is an ordinary one"]
+
+    @property
+    def action_tokenizers(self) -> tuple[Path, ...]:
+        """Folders that the tokenizer of answers may be in, if answers are read with one."""
+        return ()
+
+    @property
+    def action_tokenizer_name(self) -> str | None:
+        return None
 
     def _notes_on_version(self) -> list[str]:
         chosen = self.settings.values.get("lerobot_semantics", "auto") != "auto"

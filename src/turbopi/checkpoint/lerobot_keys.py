@@ -74,6 +74,23 @@ PI = Keys(
     ),
     _OF_PI_NEUTRAL,
 )
+PI0_FAST = Keys(
+    frozenset(
+        (_OF_PI - {"num_inference_steps", "rtc_training_max_delay"})
+        | {
+            *("max_decoding_steps", "fast_skip_tokens", "validate_action_token_prefix", "action_tokenizer_name"),
+            *("n_action_steps", "text_tokenizer_name"),
+        }
+    ),
+    frozenset(
+        ((FIRST_KEYS - _OF_PI - _OF_PI_NEUTRAL.keys()) | _TRAINING)
+        | {"relative_exclude_joints", "max_action_tokens", "use_kv_cache"}  # without keys and values: as slow as exact
+    ),
+    {
+        "image_resolution": _OF_PI_NEUTRAL["image_resolution"],
+        "temperature": ((0, None), "greedy decoding, temperature 0"),
+    },
+)
 SMOLVLA = Keys(
     frozenset(
         _OF_ALL

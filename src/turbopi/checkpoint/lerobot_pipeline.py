@@ -20,6 +20,10 @@ Preprocessor of Pi0, whose prompt has no state; what is about the prompt may sta
 
 Preprocessor of SmolVLA: as Pi0's, with smolvla_new_line_processor and any tokenizer, which the Hub's cache may hold.
 
+Preprocessor of Pi0-FAST: as Pi0.5's, with pi0_fast_prepare_state_tokenizer_processor_step, and
+
+    action_tokenizer_processor                      for training; names the action tokenizer that the folder may have
+
 Postprocessor; both may be missing:
 
     unnormalizer_processor                          scales actions back
@@ -48,6 +52,7 @@ STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."
 
 RENAME, RELATIVE, NORMALIZER = "rename_observations_processor", "relative_actions_processor", "normalizer_processor"
 STATE_STEP, TOKENIZER = "pi05_prepare_state_tokenizer_processor_step", "tokenizer_processor"
+ACTION_TOKENIZER = "action_tokenizer_processor"
 NEW_LINE = "pi0_new_line_processor"
 UNNORMALIZER, ABSOLUTE, DEVICE = "unnormalizer_processor", "absolute_actions_processor", "device_processor"
 PALIGEMMA = "google/paligemma-3b-pt-224"
@@ -69,6 +74,10 @@ _STEPS: dict[str, dict[str, tuple[str, ...]]] = {
         TOKENIZER: ("tokenizer_name", "max_length", "task_key", "padding", "padding_side", "truncation"),
         **_HARMLESS,
         **dict.fromkeys(_NEW_LINES, ()),
+        ACTION_TOKENIZER: (
+            *("action_tokenizer_name", "trust_remote_code", "max_action_tokens", "fast_skip_tokens"),
+            *("paligemma_tokenizer_name", "allow_truncation"),
+        ),
     },
     POSTPROCESSOR: {UNNORMALIZER: _SCALING, ABSOLUTE: ("enabled",), **_HARMLESS},
 }
@@ -239,7 +248,8 @@ def _read(file: Path, kind: Kind) -> list[Step]:
     needed = (STATE_STEP if FAMILIES[kind].state_in_prompt else NEW_LINE, TOKENIZER)
     for name in needed if file.name == PREPROCESSOR else ():
         if name not in names and not (name == NEW_LINE and set(names) & set(_NEW_LINES)):
-            raise CheckpointError(f"{file} has no step {name}, which every policy of type {kind} is trained with")
+            theirs = FAMILIES[kind].state_step if name == STATE_STEP else name
+            raise CheckpointError(f"{file} has no step {theirs}, which every policy of type {kind} is trained with")
     return [step for step in steps if step.name not in _OFTEN]
 
 
@@ -250,9 +260,13 @@ def _must_precede(first: str, then: str, kind: Kind) -> bool:
 
 
 def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
-    return {
-        name: keys for name, keys in _STEPS[file.name].items() if name != STATE_STEP or FAMILIES[kind].state_in_prompt
-    }
+    family = FAMILIES[kind]
+    steps = {name: keys for name, keys in _STEPS[file.name].items() if name not in (STATE_STEP, ACTION_TOKENIZER)}
+    if file.name == PREPROCESSOR and family.state_step is not None:
+        steps[family.state_step] = _STEPS[file.name][STATE_STEP]
+    if file.name == PREPROCESSOR and family.reader is not None:
+        steps[ACTION_TOKENIZER] = _STEPS[file.name][ACTION_TOKENIZER]
+    return steps
 
 
 def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
@@ -264,16 +278,19 @@ def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
             f"{file} has a step {str(given)[:200]!r} that Turbo-Pi doesn't know; known are {', '.join(known)}"
         )
     config = Fields(Fields(entry, file).object("config", {}).values, file)
-    unknown = [key for key in config.values if key not in known[name]]
+    allowed = known[name]
+    unknown = [key for key in config.values if key not in allowed]
     if unknown:
         raise CheckpointError(
             f"{file}: {name} has {unknown[0]} = {shown(config.values[unknown[0]])}, which Turbo-Pi doesn't know; it "
-            f"knows {', '.join(known[name]) or 'no key of this step'}"
+            f"knows {', '.join(allowed) or 'no key of this step'}"
         )
     if config.values.get("float_dtype") not in _SAME_NUMBERS:
         config.refuse("float_dtype", "null or float32: Turbo-Pi rounds neither observations nor actions to others")
     fields = Fields(entry, file)
     state_file = None if "state_file" not in entry else fields.text("state_file")
+    if name == FAMILIES[kind].state_step:
+        name = STATE_STEP  # whichever family's: what it computes is `Family.prompt`'s
     return Step(name, config, file, state_file, Fields(fields.object("artifacts", {}).values, file))
 
 

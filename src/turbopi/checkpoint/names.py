@@ -87,7 +87,12 @@ class Names(Protocol):
 
 
 class PiNames:
-    """Pi0's and Pi0.5's, openpi's and LeRobot's."""
+    """Pi0's and Pi0.5's, openpi's and LeRobot's.
+
+    embedding  which of the tied two LeRobot computes with
+    """
+
+    embedding: str = TIED_EMBEDDING
 
     def canonical(self, key: str) -> str | None:
         key = current_name(key)
@@ -95,3 +100,9 @@ class PiNames:
 
     def native(self, name: str) -> str:
         return to_openpi(name)
+
+
+class FastNames(PiNames):
+    """LeRobot's Pi0-FAST: where the head and the embedding are both stored, LeRobot computes with the head."""
+
+    embedding = TIED_HEAD

@@ -8,6 +8,7 @@ from typing import Any
 from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
 from turbopi.checkpoint.lerobot import LeRobotFolder, policy_type
+from turbopi.checkpoint.lerobot_fast import FastFolder
 from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder
 from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
@@ -19,9 +20,12 @@ from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, r
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import Kind, ModelConfig, PolicyConfig
-from turbopi.models import FAMILIES, parameter_shapes
+from turbopi.config import Kind, ModelConfig, Pi0FastConfig, PolicyConfig
+from turbopi.models import FAMILIES, family_of, parameter_shapes
 from turbopi.support.errors import CheckpointError, ConfigError
+from turbopi.support.hub_cache import hub_folder
+
+OPENPIS_ACTION_TOKENIZER = "physical-intelligence/fast"
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
@@ -58,7 +62,21 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
         asset_id=found.asset_id,
         expected_sha256=settings.weights_sha256,
         tokenizer_candidates=tuple(tokenizer_candidates(folder)),
+        **_openpis_action_tokenizer(settings, policy, folder),
     )
+
+
+def _openpis_action_tokenizer(settings: Settings, policy: PolicyConfig, folder: Path) -> dict[str, Any]:
+    if (family := family_of(policy.model)).reader is None:
+        if "action_tokenizer" in settings.values:
+            raise ConfigError(f"{settings.source}: action_tokenizer can't be chosen for {family.label}")
+        return {}
+    cached = hub_folder(OPENPIS_ACTION_TOKENIZER)
+    own = (folder / "action_tokenizer", *(() if cached is None else (cached,)))
+    return {
+        "action_tokenizers": _action_tokenizers(settings, own),
+        "action_tokenizer_name": OPENPIS_ACTION_TOKENIZER,
+    }
 
 
 def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[str, Any]:
@@ -150,7 +168,10 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
     return PeftSource(location.folder, weights, base.folder)
 
 
-_READERS: Mapping[Kind, type[LeRobotFolder]] = {"smolvla": SmolVLAFolder}  # by type of policy; others: LeRobotFolder
+_READERS: Mapping[Kind, type[LeRobotFolder]] = {  # by type of policy; others: LeRobotFolder
+    "smolvla": SmolVLAFolder,
+    "pi0_fast": FastFolder,
+}
 
 
 def _lerobot_folder(location: Location) -> type[LeRobotFolder]:
@@ -172,17 +193,15 @@ def _kind(location: Location, source: WeightSource) -> Kind:
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
     untied, reader = getattr(source, "untied", False), _lerobot_folder(location)
-    if reader is LeRobotFolder:
-        detect_kind(source, location.weights)  # says what weights of no family look like
+    detected = detect_kind(source, location.weights) if reader is LeRobotFolder else None  # or what they look like
     for kind, other in _READERS.items():
         if other is not reader and (keys := settings.values.keys() & other.own_settings):
             raise ConfigError(f"{settings.source}: {min(keys)} only applies to {FAMILIES[kind].label}")
     folder = reader(location.folder, settings, untied=untied)
+    if detected is not None:
+        _check_type(detected, folder)
     policy = _with_sizes(folder.policy_config(), source, settings, location)
-    if policy.model.kind != folder.kind:
-        raise CheckpointError(
-            f"{location.folder}: config.json says {folder.kind}, but these are {policy.model.kind} weights"
-        )
+    _check_type(policy.model.kind, folder)
     source.notes.extend(folder.notes())
     source.notes += notes_on_settings(
         location.folder,
@@ -199,13 +218,25 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         source=source,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
         named_tokenizer=folder.pipelines.tokenizer,
+        action_tokenizers=_action_tokenizers(settings, folder.action_tokenizers),
+        action_tokenizer_name=folder.action_tokenizer_name,
     )
+
+
+def _check_type(kind: Kind, folder: LeRobotFolder) -> None:
+    if kind != folder.kind:
+        raise CheckpointError(f"{folder.folder}: config.json says {folder.kind}, but these are {kind} weights")
+
+
+def _action_tokenizers(settings: Settings, own: tuple[Path, ...]) -> tuple[Path, ...]:
+    given = settings.values.get("action_tokenizer")
+    return own if given is None else (Path(given),)
 
 
 def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, location: Location) -> PolicyConfig:
     """`policy` with the checkpoint's sizes, after every tensor is checked against them."""
     model = policy.model
-    if isinstance(model, ModelConfig):
+    if isinstance(model, ModelConfig | Pi0FastConfig):
         model = model_sizes(source, model, vision_heads=settings.vision_heads, where=location.weights)
     check_tensors(source, parameter_shapes(model), location.weights)
     return replace(policy, model=model)

@@ -26,8 +26,8 @@ from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
 from turbopi.checkpoint.source import Piece, Shape, random_note, row_ranges
-from turbopi.config import PRESETS, ModelConfig, PolicyConfig, preset
-from turbopi.models import RANDOM, parameter_shapes
+from turbopi.config import PRESETS, PolicyConfig, preset
+from turbopi.models import RANDOM, family_of, parameter_shapes
 from turbopi.support.errors import ConfigError
 
 _ROBOT_DIMS = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14)}  # state, actions; other robots: the model's width
@@ -44,7 +44,7 @@ class RandomSource:
         self.dtypes = dict.fromkeys(self.shapes, "F32")
         self.vision_heads: int | None = None  # as in LeRobot's layout
         self._norms = 0.0  # what their scales are around: Gemma's are stored less 1
-        if isinstance(config.model, ModelConfig):
+        if family_of(config.model).paligemma:
             self.vision_heads = config.model.vision.num_heads
         else:
             self._norms = 1.0
@@ -85,6 +85,8 @@ def random_checkpoint(
         else PRESETS.get(preset_name) or RANDOM.get(preset_name) or preset(preset_name)
     )
     made_of = f"random weights, preset {config.name}, seed {seed}"
+    if family_of(config.model).reader is not None:
+        config = config.with_model(broken_answers="unread")  # they write no words
     if config_source != "auto":
         settings = read_settings(config_source, Path())
         config, made_of = _configured(config, settings), f"{made_of}, with {settings.source}"

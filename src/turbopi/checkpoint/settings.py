@@ -5,7 +5,7 @@
 optional; `preset` names what the rest starts from, and has no place beside a LeRobot checkpoint, which describes
 itself.
 
-    preset                a name of turbopi.config.PRESETS, of the same kind (Pi0 or Pi0.5) as the weights
+    preset                a name of turbopi.config.PRESETS, of the same kind (Pi0, Pi0.5, Pi0-FAST) as the weights
     name                  what the policy is called
     robot                 "libero", "droid", ... or a robot's .json, relative to this file
     robot_options         object, passed to the robot in place of the preset's, which are for the preset's robot alone
@@ -31,6 +31,10 @@ itself.
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
+    missing_cameras       "masked", or "black": seen as black images, as by openpi's Pi0-FAST
+    action_tokenizer, max_decoding_steps, broken_answers
+                          of Pi0-FAST alone: folder of the action tokenizer, relative to this file; tokens of an answer,
+                          1 to 1000; "refuse", or "owners" for what the owner's code makes of an answer that is broken
     vlm                   of SmolVLA alone: folder of the vision-language model's config.json, relative to this file
     weights_sha256        what `turbopi inspect --hash` shows of these weights: others are refused at loading
 
@@ -61,6 +65,7 @@ ABOUT_WEIGHTS = {
     "lora_rslora",
     "base_model",
     "vlm",
+    "action_tokenizer",
     "weights_sha256",
     "lerobot_semantics",
 }  # keys of a .json
@@ -141,19 +146,20 @@ _OF_POLICY = (
     "prompt_state_dim",
     "prompt_as_is",
     "prompt_labels",
+    "missing_cameras",
     "num_denoising_steps",
     "solver",
     "solver_grid",
     "real_time",
 )
-_OF_MODEL = ("action_horizon", "max_prompt_tokens", "time_grid")
+_OF_MODEL = ("action_horizon", "max_prompt_tokens", "time_grid", "max_decoding_steps", "broken_answers")
 
 
 def values_of(config: PolicyConfig) -> dict[str, object]:
     """What a .json may say of a policy, and this one has."""
     return {
         **{key: getattr(config, key) for key in _OF_POLICY},
-        **{key: getattr(config.model, key) for key in _OF_MODEL},
+        **{key: getattr(config.model, key) for key in _OF_MODEL if hasattr(config.model, key)},
     }
 
 
@@ -214,7 +220,7 @@ def _undetectable(fitting: list[str], kind: Kind, assets: list[str], where: Path
 
 def _read_file(file: Path) -> Settings:
     parsed = parse_values(read_json(file, ConfigError), str(file))
-    for folder in parsed.keys() & {"base_model", "vlm"}:
+    for folder in parsed.keys() & {"base_model", "vlm", "action_tokenizer"}:
         parsed[folder] = str((file.parent / Path(parsed[folder]).expanduser()).resolve())
     robot = parsed.get("robot")
     if robot is not None and robot.endswith(".json"):
@@ -376,5 +382,9 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "lora_rslora": ("true or false", _flag),
     "base_model": ("a folder", _text),
     "vlm": ("a folder", _text),
+    "action_tokenizer": ("a folder", _text),
+    "max_decoding_steps": _count(LIMITS["max_decoding_steps"]),
+    "broken_answers": ("'refuse' or 'owners'", _choice("refuse", "owners")),
+    "missing_cameras": ("'masked' or 'black'", _choice("masked", "black")),
     "weights_sha256": ("64 digits, 0 to 9 and a to f, as `turbopi inspect --hash` shows them", _sha256),
 }

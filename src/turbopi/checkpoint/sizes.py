@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from math import isqrt
-from typing import get_args
+from typing import Any, get_args
 
 from turbopi.checkpoint.source import Shape, WeightSource, listing
-from turbopi.config import LIMITS, GemmaConfig, ModelConfig, PiKind, VisionConfig
+from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, Pi0FastConfig, PiKind, VisionConfig
 from turbopi.models import FAMILIES
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import shown
@@ -32,20 +32,23 @@ _PROBES = (
     "expert.layers.0.mlp.gate_proj.weight",
     "action_in_proj.weight",
 )
+_OF_EXPERT = ("expert.", "action_")
 
 
-def detect_kind(source: WeightSource, where: object) -> PiKind:
-    """Pi0.5 or Pi0, by the marks of its weights. CheckpointError if it is neither, or both."""
+def detect_kind(source: WeightSource, where: object) -> Kind:
+    """Pi0.5, Pi0 or Pi0-FAST, by the marks of its weights. CheckpointError if it is none of them, or Pi0.5 and Pi0."""
     names = source.shapes
     families = {kind: FAMILIES[kind] for kind in get_args(PiKind)}
     marked = {kind: [name for name in names if name.startswith(one.marks)] for kind, one in families.items()}
     fitting: list[PiKind] = [kind for kind, ours in marked.items() if ours]
     has_actions = any(name.startswith(("action_in_proj.", "expert.")) for name in names)
     if not has_actions and any(name.startswith("vlm.") for name in names):
-        raise CheckpointError(
-            f"{where} has a language model but no action expert: this looks like Pi0-FAST, which decodes action tokens "
-            "one by one. Turbo-Pi runs flow-matching policies; serve this checkpoint with openpi"
-        )
+        if source.format == "openpi_torch":
+            raise CheckpointError(
+                f"{where} has a language model but no action expert: this looks like LeRobot's Pi0-FAST, but no "
+                "config.json beside it says so: copy LeRobot's config.json and its processors' files there, too"
+            )
+        return "pi0_fast"
     for other in (one for kind, one in FAMILIES.items() if kind not in families):
         if any(name.startswith(other.marks) for name in names):
             raise CheckpointError(
@@ -66,11 +69,11 @@ def detect_kind(source: WeightSource, where: object) -> PiKind:
 
 def model_sizes(
     source: WeightSource,
-    base: ModelConfig,
+    base: ModelConfig | Pi0FastConfig,
     *,
     vision_heads: int | None,
     where: object,
-) -> ModelConfig:
+) -> ModelConfig | Pi0FastConfig:
     """`base` with its kind and every size replaced by what the parameters' shapes say.
 
     Of `base` stay the horizon, the prompt length, the time grid and the constants. Vision heads, which the PyTorch
@@ -79,23 +82,27 @@ def model_sizes(
 
     Raises CheckpointError if a parameter that sizes are read from is missing or impossible.
     """
-    shapes = source.shapes
-    absent = [source.native_name(name) for name in _PROBES if name not in shapes]
+    shapes, has_expert = source.shapes, isinstance(base, ModelConfig)
+    probes = [name for name in _PROBES if has_expert or not name.startswith(_OF_EXPERT)]
+    absent = [source.native_name(name) for name in probes if name not in shapes]
     if absent:
         raise CheckpointError(f"{where}: tensors are missing: {listing(absent)}")
     try:
         vision = _vision_sizes(shapes, base.vision)
         depth = max(_depth(shapes, "vlm.layers."), _depth(shapes, "expert.layers."))  # check_tensors: absent layers
-        vlm, expert = _gemma_sizes(shapes, "vlm", depth), _gemma_sizes(shapes, "expert", depth)
-        vocab_size, action_dim = shapes["vlm.embed_tokens.weight"][0], shapes["action_in_proj.weight"][1]
+        found: dict[str, Any] = {"vlm": _gemma_sizes(shapes, "vlm", depth)}
+        found["vocab_size"] = shapes["vlm.embed_tokens.weight"][0]
+        if has_expert:
+            found |= {
+                "expert": _gemma_sizes(shapes, "expert", depth),
+                "action_dim": shapes["action_in_proj.weight"][1],
+                "kind": detect_kind(source, where),
+            }
     except (IndexError, ZeroDivisionError, ValueError) as error:
         raise CheckpointError(f"{where}: tensors have impossible shapes ({error})") from error
     vision = replace(vision, num_heads=_vision_heads(source, vision.width, base.vision, vision_heads, where))
-    kind = detect_kind(source, where)
     try:
-        return replace(
-            base, kind=kind, vision=vision, vlm=vlm, expert=expert, vocab_size=vocab_size, action_dim=action_dim
-        )
+        return replace(base, vision=vision, **found)
     except ConfigError as error:
         raise CheckpointError(f"{where}: {error}") from error
 

@@ -130,9 +130,11 @@ class TorchSource:
                 "unclear which one the model was trained with. Remove the wrong one from the file"
             )
         # a look at the first rows will do: weight decay changes all of them
+        taken = head if getattr(self.names, "embedding", TIED_EMBEDDING) == TIED_HEAD else embedding
         if not torch.equal(read_tensor(head)[:1024], read_tensor(embedding)[:1024]):
-            self.notes.append("lm_head and embed_tokens differ: prompts are embedded by embed_tokens, as LeRobot does")
-        return embedding
+            name = "lm_head" if taken is head else "embed_tokens"
+            self.notes.append(f"lm_head and embed_tokens differ: prompts are embedded by {name}, as LeRobot does")
+        return taken
 
 
 def _read_headers(folder: Path) -> list[Stored]:

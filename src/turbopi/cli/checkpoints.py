@@ -162,7 +162,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
             *((f"  its {key}", value) for key, value in info.get("observation", {}).items()),
-            ("action horizon", f"{info['action_horizon']}, denoising in {denoising(info)}"),
+            ("action horizon", f"{info['action_horizon']}, {_made_in(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             *([] if info["memory"] is None else [("memory", _memory(info["memory"]))]),
             ("statistics", _statistics_source(info)),
@@ -199,6 +199,13 @@ def _tokenizer(info: dict[str, Any]) -> str:
     if cached.is_file():
         return f"none in the folder; openpi's: {cached}"
     return "none in the folder or in openpi's cache: `turbopi doctor` says where to get it"
+
+
+def _made_in(info: dict[str, Any]) -> str:
+    if "max_decoding_steps" not in info:
+        return f"denoising in {denoising(info)}"
+    found = info["action_tokenizers"] or ["which isn't here"]
+    return f"written in {denoising(info)}, read by the action tokenizer {found[0]}"
 
 
 def _statistics_source(info: dict[str, Any]) -> str:

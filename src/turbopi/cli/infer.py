@@ -85,7 +85,7 @@ def infer(
     """Turn an observation into an action chunk.
 
     The .npz gets `actions`, float64[H, d] in the robot's units ([N, H, d] for a recording of N calls), and `noise`, the
-    noise they started from.
+    noise they started from, empty for a model that takes none.
     """
     output = Output(as_json)
     checkpoint, source = options.split("infer", paths, "observation")
@@ -95,6 +95,7 @@ def infer(
         raise ConfigError("--plot and --no-plot were both given; give one of them")
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
+    from turbopi.models import family_of
     from turbopi.policy.call_options import checked_noise
     from turbopi.policy.readings import Checks
     from turbopi.recordings import load_observation
@@ -119,6 +120,8 @@ def infer(
     noted, ranges = _Notes(output), checks.drawn
     noted.of(sources[0], checks.reading(seen))
     model = opened.config.model
+    if noise is not None and (why := family_of(model).refuses_flow) is not None:
+        raise ConfigError(f"--noise: {why}")
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
     policy = options.make_policy(opened, output)
@@ -154,7 +157,7 @@ class _Answer:
     """One call. The observation is kept only while a plot may show it."""
 
     observation: dict[str, object] | None
-    noise: "np.ndarray"
+    noise: "np.ndarray | None"
     actions: "np.ndarray"
     timing: dict[str, float]
     notes: list[dict[str, Any]]
@@ -218,10 +221,16 @@ def _sources(path: Path, call: int | None) -> list[Path]:
 
 def _noise(
     model: "Network", given: "np.ndarray | None", seed: int | None, output: Output
-) -> Callable[[int], "np.ndarray"]:
-    """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
+) -> Callable[[int], "np.ndarray | None"]:
+    """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i; None: the
+    model takes none.
+    """
     import numpy as np
 
+    from turbopi.models import family_of
+
+    if family_of(model).refuses_flow is not None:
+        return lambda number: None
     if given is not None:
         return lambda number: given
     shape = (model.action_horizon, model.action_dim)
@@ -248,7 +257,7 @@ class _Notes:
 
 
 def _run(
-    policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray"], noted: _Notes
+    policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray | None"], noted: _Notes
 ) -> list[_Answer]:
     """Every observation through the policy. ObservationError names the file of a recording that is wrong."""
     from turbopi.policy.watch import READING
@@ -287,7 +296,8 @@ def _write(out: Path, answers: list[_Answer], output: Output) -> None:
     import numpy as np
 
     actions = _joined([answer.actions for answer in answers])
-    noise = _joined([answer.noise for answer in answers])
+    drawn = [answer.noise for answer in answers if answer.noise is not None]
+    noise = _joined(drawn) if drawn else np.empty(0, np.float32)
     write_whole(out, lambda stream: np.savez(stream, actions=actions, noise=noise))
     output.line(f"actions [{' x '.join(map(str, actions.shape))}] written to {out}")
 

@@ -142,8 +142,8 @@ def _show(document: "Certificate", output: Output) -> None:
     output.table(_intermediates(document))
     output.line(
         f"Where a name has layers or steps, the worst, with its number. Control: {document.control}. The error of "
-        "the actions decides, by their bound. Of all else `allowed` is informative: an error above it hints at where "
-        "a fault may be, and fails nothing by itself.",
+        f"the {document.decides} decides, by their bound. Of all else `allowed` is informative: an error above it "
+        "hints at where a fault may be, and fails nothing by itself.",
         "dim",
     )
     output.table(_dimensions(document.actions.dimensions))
@@ -163,11 +163,13 @@ def _show(document: "Certificate", output: Output) -> None:
             f"throttling {gpu.throttling}"
         )
     if document.first_off is not None:
-        informs = " (informative: the actions decide, and they pass)" if document.ok else ""
+        informs = f" (informative: the {document.decides} decide, and they pass)" if document.ok else ""
         output.line(f"first off: {document.first_off.text}{informs}", "yellow")
     bounds = document.bounds
     own = " (overridden)" if bounds.overridden else ""
-    output.line(f"bound{own}: actions' relative rms {significant(bounds.actions_relative_rms)}: {bounds.reason}")
+    output.line(
+        f"bound{own}: {document.decides}' relative rms {significant(bounds.actions_relative_rms)}: {bounds.reason}"
+    )
     for check in document.checks:
         output.line(f"{'ok  ' if check.ok else 'FAIL'} {check.text}", None if check.ok else "red")
 
@@ -196,14 +198,14 @@ def _intermediates(document: "Certificate") -> Table:
         if row.name not in worst or row.badness > worst[row.name].badness:
             worst[row.name] = row
     for name, row in worst.items():
-        control, decides, above = row.control, name == "actions", row.above
+        control, decides, above = row.control, name == document.decides == "actions", row.above
         if decides:
             table.add_section()
         table.add_row(
             name if row.index is None else f"{name}, {row.index}",
             significant(row.relative_rms),
             "-" if control is None else significant(control.relative_rms),
-            significant(row.allowed),
+            "-" if name == "actions" and not decides else significant(row.allowed),
             ("FAIL, decides" if above else "ok, decides") if decides else ("above, informs" if above else ""),
             cosine(row.cosine),
             significant(row.max),

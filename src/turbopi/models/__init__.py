@@ -8,9 +8,10 @@ import torch
 from turbopi.config import PRESETS, Kind, Network, PolicyConfig, memory_of
 from turbopi.models.family import Family
 from turbopi.models.pi0.family import PI0, PI05, PI05_STATE_MEMORY, PI05_VISUAL_MEMORY
+from turbopi.models.pi0_fast.family import PI0_FAST
 from turbopi.models.smolvla.family import BASE, SMOLVLA
 
-FAMILIES: dict[Kind, Family] = {one.kind: one for one in (PI05, PI0, SMOLVLA)}
+FAMILIES: dict[Kind, Family] = {one.kind: one for one in (PI05, PI0, PI0_FAST, SMOLVLA)}
 
 RANDOM: dict[str, PolicyConfig] = {**PRESETS, BASE.name: BASE}  # what random weights are made for, by name
 

@@ -1,12 +1,40 @@
 """What a family of models gives beside its sizes (config.py) and its reference: what all other code asks about it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from turbopi.config import FloatPrecision, Kind
+
+
+class Pieces(Protocol):
+    """PaliGemma's tokenizer; `sentencepiece.SentencePieceProcessor` is one."""
+
+    def id_to_piece(self, id: int) -> str: ...
+    def encode(self, text: str) -> list[int]: ...
+    def decode(self, ids: list[int]) -> str: ...
+    def vocab_size(self) -> int: ...
+
+
+class AnswerReader(Protocol):
+    """What makes actions of the ids that a model wrote.
+
+    ends  ids at which an answer may be over; `over` decides it
+    """
+
+    @property
+    def ends(self) -> Sequence[int]: ...
+
+    def over(self, ids: Sequence[int]) -> bool:
+        """Whether what follows these ids, the last of which is one of `ends`, changes no action."""
+
+    def actions(self, ids: Sequence[int]) -> NDArray[np.float32]:
+        """float32[H, action_dim], normalised. Raises ActionError for a broken answer."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +47,8 @@ class Family:
     counts           where `planned` is false, (config, cameras, prompt tokens, horizon, steps, batch) -> stage:
                      (operations, numbers through memory), for the roofline
     parameter_dtype  (canonical name, precision, config) -> the dtype of a parameter
+    reader           (config, PaliGemma's tokenizer, the action tokenizer's folder) -> what makes actions of an answer:
+                     the model writes its actions as tokens, one after the other. None: a flow makes them of noise
 
     The loop that the engine, the backends and the roofline plan by:
 
@@ -32,11 +62,12 @@ class Family:
     Its checkpoints and prompts:
 
     marks            beginnings of names of weights that only this family has, the most telling one first
-    state_in_prompt  whether LeRobot writes the state into the prompt; else the prompt is taken as it is
+    state_step       the step of LeRobot's that writes the state into the prompt; None: the prompt is taken as it is
     state_in_prefix  the state is a token of the prefix
     prompt_tokens    LeRobot's longest prompt, unless a checkpoint says another
     paligemma        prompts are tokenised as PaliGemma's, with a beginning-of-sequence token; else by the checkpoint's
                      own tokenizer.json, without one
+    prompt           (config, prompt, the state's numbers) -> the text that is tokenised; None: by Pi0's rules
     """
 
     kind: Kind
@@ -46,12 +77,28 @@ class Family:
     modulated: bool
     state_token: bool
     marks: tuple[str, ...]
-    state_in_prompt: bool
+    state_step: str | None
     prompt_tokens: int
     planned: bool = True
     state_in_prefix: bool = False
     paligemma: bool = True
     counts: Callable[[Any, int, int, int, int, int], dict[str, tuple[int, int]]] | None = None
+    prompt: Callable[[Any, str, str], str] | None = None
+    reader: Callable[[Any, Pieces, Path | None], AnswerReader] | None = None
+
+    @property
+    def state_in_prompt(self) -> bool:
+        return self.state_step is not None
+
+    @property
+    def refuses_flow(self) -> str | None:
+        """Why a call can't have what only a flow from noise to actions has; None if it can."""
+        if self.reader is None:
+            return None
+        return (
+            f"{self.label} writes its actions as tokens, one after the other: it has no noise, no denoising steps, no "
+            "solver or time grid, and its chunks have the config's action horizon and can't be joined"
+        )
 
     @property
     def reads_state(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from turbopi.config import LIMITS, GridName, PolicyConfig, Solver, TimeGrid
 from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, fit
 from turbopi.engine.loops import EulerLoop
+from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.solvers import (
     Integration,
@@ -55,17 +56,24 @@ def _checked(what: str, number: int, most: int, error: Error) -> int:
 
 @dataclass(frozen=True)
 class Denoising:
-    """How noise becomes actions: evaluations of the action expert, solver, time grid. A policy's own, or a call's."""
+    """How noise becomes actions: evaluations of the action expert, solver, time grid. A policy's own, or a call's.
+
+    refused  why a model has nothing of the kind: then `steps` are tokens of an answer at most
+    """
 
     steps: int
     solver: Solver = "euler"
     time_grid: GridName | tuple[float, ...] = "uniform"
+    refused: str | None = None
 
     @classmethod
     def of(
         cls, config: PolicyConfig, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None
     ) -> "Denoising":
         """A policy's: its config's, unless it says otherwise. Raises ConfigError."""
+        if (why := family_of(config.model).refuses_flow) is not None:
+            model: Any = config.model
+            return cls(model.max_decoding_steps, refused=why).changed(steps, solver, time_grid, ConfigError)
         number = checked_steps(config.num_denoising_steps, ConfigError)
         own = cls(number).changed(None, config.solver, config.solver_grid, ConfigError)
         if own.steps != number and intervals(own.solver, number) == intervals(own.solver, own.steps):
@@ -78,6 +86,10 @@ class Denoising:
         """The same but for what isn't None. Times bring their number of steps, unless it is given, too."""
         if steps is None and solver is None and time_grid is None:
             return self
+        if self.refused is not None:
+            if solver is None and time_grid is None and steps == self.steps:  # as the policy itself calls
+                return self
+            raise error(self.refused)
         try:
             chosen = self.solver if solver is None else checked_solver(solver)
             grid = self.time_grid if time_grid is None else checked_grid(time_grid)
@@ -124,6 +136,8 @@ class Denoising:
     @property
     def metadata(self) -> dict[str, Any]:
         """Plain values."""
+        if self.refused is not None:
+            return {"num_denoising_steps": 0, "max_decoding_steps": self.steps}
         grid = self.time_grid if isinstance(self.time_grid, str) else list(self.time_grid)
         return {"num_denoising_steps": self.steps, "solver": self.solver, "time_grid": grid}
 

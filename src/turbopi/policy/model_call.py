@@ -5,7 +5,8 @@ A backend that can starts on the images first, and prompts are tokenised meanwhi
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,9 @@ from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy.chunk_conditioning import ChunkConditioning, Joins
 from turbopi.policy.history import ObservationHistory, given_frames
 from turbopi.policy.readings import Checks, Reading
+from turbopi.preprocess.answers import Unjudged
 from turbopi.preprocess.pipeline import Incoming, Pipeline
+from turbopi.robots.base import Example
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,24 @@ class ModelCall:
         states, readings = [seen.state for seen in each], [self._checks.reading(seen) for seen in each]
         x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states)
         requested = time.perf_counter()
-        with self.lock, self._guard:
+        with self._turn(observations):
             infer_start = time.perf_counter()
             of_rows = histories if self._memory else [None] * len(each)
             inputs = [self.recorded(*one) for one in zip(episodes, of_rows, strict=True)]
             sample = self._backend.sample(Observation.stack(inputs), x_1, joins.steps, conditioning=conditioning)
             return Ran(sample, states, readings, requested, infer_start, time.perf_counter())
+
+    @contextmanager
+    def _turn(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[None]:
+        """One call at a time. Answers to made-up observations aren't judged: a model may write anything there."""
+        with self.lock, self._guard:
+            reader = self._backend.reader
+            if reader is not None and all(isinstance(one, Example) for one in observations):
+                self._backend.reader = Unjudged(reader, self._pipeline.config)
+            try:
+                yield
+            finally:
+                self._backend.reader = reader
 
     def see(self, observation: Mapping[str, Any]) -> list[tuple[Incoming, ModelInputs]]:
         """An observation, the last one, behind the frames that it brings itself."""
@@ -99,7 +114,7 @@ class ModelCall:
     def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
         each = [self._pipeline.see(obs, resize=False) for obs in observations]
         requested = time.perf_counter()
-        with self.lock, self._guard:
+        with self._turn(observations):
             infer_start = time.perf_counter()
             images, resize = [seen.camera_images for seen in each], self._pipeline.config.image_resize
             begun = self._backend.begin_batch(images, resize, joins.forms)

@@ -1,5 +1,6 @@
 """The whole policy on one screen: preprocess → backend → postprocess."""
 
+import copy
 import dataclasses
 import logging
 import time
@@ -38,6 +39,7 @@ from turbopi.policy.history import ObservationHistory
 from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
 from turbopi.policy.watch import PolicyWatch
+from turbopi.preprocess.answers import reader_of
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.calibration_file import Quantization
@@ -51,7 +53,7 @@ logger = logging.getLogger(__name__)
 class UnifiedPolicy:
     """A policy over any backend: observation in, action chunk out, as its owner's code computes it.
 
-    Pi0.5 and Pi0 as openpi and LeRobot, SmolVLA as LeRobot.
+    Pi0.5, Pi0 and Pi0-FAST as openpi and LeRobot, SmolVLA as LeRobot.
 
         policy = UnifiedPolicy("checkpoints/pi05_libero", config="pi05_libero")
         actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
@@ -115,6 +117,7 @@ class UnifiedPolicy:
             name, why = backends.choose(self._device, precision, model)
         self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
         prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
+        reader = reader_of(checkpoint, prompt_tokenizer)
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
         self._checks = Checks(
             self._pipeline, checkpoint.norm_stats, out_of_range, judges_ranges=checkpoint.format != "random"
@@ -137,7 +140,8 @@ class UnifiedPolicy:
             self.backend = backends.create(
                 name, model, load, device=self._device, precision=precision, quantization=calibration
             )
-        self.backend.strict = self._strict = strict
+        self.backend.strict, self.backend.reader = strict, reader
+        self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
         self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard, self._checks)
         self._memory = memory_of(model)
@@ -331,6 +335,12 @@ class UnifiedPolicy:
         running.add_done_callback(finish)
         return answer
 
+    def writing(self, tokens: int) -> "UnifiedPolicy":
+        """The same policy with another limit on an answer's tokens, at most the config's."""
+        other = copy.copy(self)
+        other._denoising = dataclasses.replace(self._denoising, steps=tokens)
+        return other
+
     def reset(self) -> None:
         """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before, memory is empty."""
         self._watch.reset()
@@ -401,7 +411,9 @@ class UnifiedPolicy:
         example = self.example_observation()
         inputs = self.prepare(example)
         own = int(inputs.image_mask.sum())
-        sent = [own, *(getattr(self._pipeline.robot, "camera_counts", None) or ())]  # the example's first
+        sent = [own]  # the example's first
+        if self.config.missing_cameras == "masked":
+            sent += getattr(self._pipeline.robot, "camera_counts", None) or ()
         counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
         sizes = several("batches", 1 if batches is None else batches, [], checked_batch)
         loops = warm_loops(
@@ -519,5 +531,9 @@ class UnifiedPolicy:
         return int(horizon)
 
     def _noise(self, batch: int, horizon: int, noise: Any, seed: int | Sequence[int] | None) -> np.ndarray:
-        """float32[B, H, action_dim], given or drawn."""
+        """float32[B, H, action_dim], given or drawn; zeros where nothing is made of noise."""
+        if (why := self._denoising.refused) is not None:
+            if noise is not None:
+                raise ObservationError(why)
+            return np.zeros((batch, horizon, self.config.model.action_dim), np.float32)
         return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)

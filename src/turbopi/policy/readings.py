@@ -85,8 +85,8 @@ class Checks:
                 self._labels.clear()
             labels = self._labels[seen.cameras] = [camera_label(self._robot, camera) for camera in seen.cameras]
         images = seen.robot.images
-        known = zip(labels, seen.cameras, seen.valid, strict=True)
-        return {label: sample(np.asarray(images[camera])) for label, camera, valid in known if valid}
+        known = zip(labels, seen.cameras, seen.sent, strict=True)
+        return {label: sample(np.asarray(images[camera])) for label, camera, sent in known if sent}
 
     def judge(
         self, chunks: np.ndarray, readings: Sequence[Reading | None]

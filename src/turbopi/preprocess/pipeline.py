@@ -5,6 +5,7 @@ state goes into the prompt normalised but not padded (but by LeRobot 0.4), and r
 un-normalised: openpi un-normalises what it has normalised, LeRobot has kept what came.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -42,7 +43,8 @@ class Incoming:
     resize          False: images in uint8 keep their size, for a backend that resizes them
     cameras         the model's, in its order: keys of the robot's images
     images        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
-    valid           of each camera, whether there is such an image
+    sent            of each camera, whether the observation has it
+    valid           of each camera, whether the model sees an image of it
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
@@ -54,6 +56,7 @@ class Incoming:
     prompt: str = field(init=False)
     cameras: tuple[str, ...] = field(init=False)
     camera_images: list[np.ndarray] = field(init=False)
+    sent: list[bool] = field(init=False)
     valid: list[bool] = field(init=False)
 
     state: np.ndarray = field(init=False)
@@ -84,6 +87,8 @@ class Pipeline:
     robot           instead of the config's: a name, a description's path, or an object. The config's options are for
                     the robot that it names alone
 
+    write           how the family's prompts are written, where it has rules of its own (`Family.prompt`)
+
     `notes` says what the user had better look at. Raises ConfigError if these don't fit each other. Calls change
     nothing in it but which long prompt was warned about.
     """
@@ -110,7 +115,10 @@ class Pipeline:
         scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
         self._adds_raw_state = mask is not None and scaled_by_lerobot
         self._image_shape = (config.model.image_size,) * 2
+        write = family_of(config.model).prompt
+        self.write = None if write is None else functools.partial(write, config.model)
         self._float_images = WAYS[config.image_resize].float_images
+        self._black = np.zeros((*self._image_shape, 3), np.uint8) if config.missing_cameras == "black" else None
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
         self.before_vision: tuple[Callable[[Incoming], None], ...] = (
             self._read_observation,
@@ -299,11 +307,13 @@ class Pipeline:
         camera_images, present = sample.robot.images, sample.robot.image_mask
         final = sample.robot.in_order or not _CAMERAS.issuperset(camera_images)
         sample.cameras = tuple(camera_images) if final else CAMERAS
+        sample.sent = [present.get(camera, camera in camera_images) for camera in sample.cameras]
         sample.valid, checked = [], []
-        for camera in sample.cameras:
-            valid = present.get(camera, camera in camera_images)
-            sample.valid.append(valid)
-            if valid:
+        for camera, sent in zip(sample.cameras, sample.sent, strict=True):
+            sample.valid.append(sent or self._black is not None)
+            if self._black is not None and not sent:
+                checked.append(self._black)
+            elif sent:
                 camera_image = camera_images.get(camera)
                 checked.append(camera_image if is_rgb8(camera_image) else self._checked_image(camera_image, camera))
         shape, resize = self._image_shape, self.config.image_resize
@@ -330,6 +340,7 @@ class Pipeline:
             max_tokens=self.config.model.max_prompt_tokens,
             as_is=self.config.prompt_as_is,
             labels=self.config.prompt_labels,
+            write=self.write,
         )
 
     def _pad_state(self, sample: Incoming) -> None:

@@ -6,7 +6,7 @@ Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcess
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -50,17 +50,30 @@ def state_bins(state: np.ndarray) -> np.ndarray:
     return np.asarray(_STATE_EDGES.searchsorted(state, side="right") - 1)
 
 
+Write = Callable[[str, str], str]  # (prompt, the state's numbers) -> the text of a family with rules of its own
+
+
 def prompt_texts(
-    prompt: str, state: np.ndarray | None, *, as_is: bool = False, labels: bool = False
+    prompt: str,
+    state: np.ndarray | None,
+    *,
+    as_is: bool = False,
+    labels: bool = False,
+    write: Write | None = None,
 ) -> list[tuple[str, bool]]:
-    """What is encoded, in order: (text, whether BOS goes before it). `as_is` and `labels`: see `encode`."""
+    """What is encoded, in order: (text, whether BOS goes before it). `as_is`, `labels`, `write`: see `encode`."""
+    if write is not None:
+        return [(write(prompt, _numbers(np.empty(0) if state is None else state)), True)]
     if as_is and state is None:
         return [(prompt if prompt.endswith("\n") else prompt + "\n", True)]
     cleaned = clean_prompt(prompt)
     if state is None:
         return [(f"Task: {cleaned};\nAction: ", True)] if labels else [(cleaned, True), ("\n", False)]
-    numbers = " ".join(map(str, state_bins(state).tolist()))
-    return [(f"Task: {cleaned}, State: {numbers};\nAction: ", True)]
+    return [(f"Task: {cleaned}, State: {_numbers(state)};\nAction: ", True)]
+
+
+def _numbers(state: np.ndarray) -> str:
+    return " ".join(map(str, state_bins(state).tolist()))
 
 
 class PromptTokenizer:
@@ -77,12 +90,19 @@ class PromptTokenizer:
         self._newline: list[int] | None = None  # Pi0's, which is encoded by itself: always the same
 
     def encode(
-        self, prompt: str, state: np.ndarray | None = None, *, as_is: bool = False, labels: bool = False
+        self,
+        prompt: str,
+        state: np.ndarray | None = None,
+        *,
+        as_is: bool = False,
+        labels: bool = False,
+        write: Write | None = None,
     ) -> list[int]:
         """All ids of `prompt`, neither padded nor truncated. `state` [d], normalised, goes into the text.
 
         as_is   a prompt without state keeps its blanks, underscores and newlines, as in LeRobot's Pi0
         labels  a prompt without state keeps "Task: " and "Action: ", as in LeRobot's Pi0.5
+        write   in place of these rules (`Family.prompt`)
 
         Raises ObservationError for a prompt that can't be encoded, TokenizerError for ids past the vocabulary.
         """
@@ -92,7 +112,7 @@ class PromptTokenizer:
             prompt.encode()
         except UnicodeEncodeError as error:
             raise ObservationError(f"the prompt isn't valid Unicode text: {error}") from error
-        (text, bos), *newline = prompt_texts(prompt, state, as_is=as_is, labels=labels)
+        (text, bos), *newline = prompt_texts(prompt, state, as_is=as_is, labels=labels, write=write)
         ids = self._ids(text, bos)
         if newline:
             self._newline = self._newline or self._ids(*newline[0])
@@ -116,13 +136,14 @@ class PromptTokenizer:
         max_tokens: int,
         as_is: bool = False,
         labels: bool = False,
+        write: Write | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
-        `as_is`, `labels`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
+        `as_is`, `labels`, `write`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
         `truncation_side` says; a warning is logged once for each.
         """
-        ids = self.encode(prompt, state, as_is=as_is, labels=labels)
+        ids = self.encode(prompt, state, as_is=as_is, labels=labels, write=write)
         count = min(len(ids), max_tokens)
         if count < len(ids):
             left = getattr(self.encoder, "truncation_side", "right") == "left"

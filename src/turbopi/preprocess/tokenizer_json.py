@@ -57,8 +57,17 @@ class TokenizerJson:
         except RuntimeError as error:
             raise TokenizerError(f"{file} can't be read as SentencePiece pieces: {one_line(error)}") from error
 
-    def encode(self, text: str, *, add_bos: bool) -> list[int]:
+    def encode(self, text: str, *, add_bos: bool = False) -> list[int]:
         return [self.bos] * add_bos + list(map(int, self._processor.encode(text)))
+
+    def decode(self, ids: list[int]) -> str:
+        return str(self._processor.decode(ids))
+
+    def id_to_piece(self, id: int) -> str:
+        return self.pieces[id] if 0 <= id < len(self.pieces) else ""
+
+    def vocab_size(self) -> int:
+        return self.size
 
     def _refuse(self, key: str, value: object, expected: str) -> None:
         found = value if isinstance(value, str) else shown(value)

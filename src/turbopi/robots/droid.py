@@ -9,6 +9,7 @@ import numpy as np
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
+    black_like,
     optional_prompt,
     random_image,
     read_state,
@@ -34,7 +35,11 @@ class Droid(Robot):
             observation/joint_position   float[7];   observation/gripper_position   float[1] or a scalar
             prompt
     out     [H, 8]: 7 joint velocities, gripper position
+
+    wrist_last   a black image stands between the two cameras: so in openpi's pi0_fast_droid
     """
+
+    wrist_last: bool = False
 
     name = "droid"
     state_dim = 8
@@ -44,10 +49,15 @@ class Droid(Robot):
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         base = parse_image(require(observation, KEYS[0], KEYS), KEYS[0])
         wrist = parse_image(require(observation, KEYS[1], KEYS), KEYS[1])
-        images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
+        if self.wrist_last:
+            images = {"base_0_rgb": base, "base_1_rgb": black_like(base), "wrist_0_rgb": wrist}
+            mask = {camera: camera != "base_1_rgb" for camera in images}
+        else:
+            images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
         joints = read_state(require(observation, KEYS[2], KEYS), KEYS[2], 7)
         gripper = read_state(require(observation, KEYS[3], KEYS), KEYS[3], 1)
-        return RobotInputs(images, mask, np.concatenate([joints, gripper]), optional_prompt(observation))
+        state = np.concatenate([joints, gripper])
+        return RobotInputs(images, mask, state, optional_prompt(observation), in_order=self.wrist_last)
 
     def outputs(self, actions: np.ndarray) -> np.ndarray:
         return actions[:, : self.action_dim]

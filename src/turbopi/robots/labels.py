@@ -37,6 +37,7 @@ _CAMERAS = {
     "droid": {
         "base_0_rgb": "observation/exterior_image_1_left",
         "left_wrist_0_rgb": "observation/wrist_image_left",
+        "wrist_0_rgb": "observation/wrist_image_left",
     },
     "aloha": {
         "base_0_rgb": "images/cam_high",

@@ -52,6 +52,8 @@ def names_known(typed: str, reported: str, known: Iterable[str]) -> str:
 
 def denoising(about: Mapping[str, object]) -> str:
     """ "10 steps" of a policy's metadata, and its solver and time grid where they aren't openpi's."""
+    if "max_decoding_steps" in about:
+        return f"at most {about['max_decoding_steps']} tokens"
     said = f"{about.get('num_denoising_steps')} steps"
     solver, grid = about.get("solver", "euler"), about.get("time_grid", "uniform")
     if solver != "euler":

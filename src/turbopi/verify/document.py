@@ -82,7 +82,7 @@ class IntermediateDocument(Struct, frozen=True, kw_only=True):
     rms: Number
     max: Number
     finite: bool
-    allowed: Number  # of its relative rms; it decides about the actions alone
+    allowed: Number  # of its relative rms; it decides about the actions alone. None: nothing is held to it
     control: ErrorsDocument | None  # None: the control doesn't show it
 
     @property
@@ -100,7 +100,7 @@ class IntermediateDocument(Struct, frozen=True, kw_only=True):
 class Check(Struct, frozen=True):
     """One of the things that decide."""
 
-    name: str  # "signal", "actions", "deltas", "finite", "determinism"
+    name: str  # "signal", "actions" or "logits", "answers", "deltas", "finite", "determinism"
     ok: bool
     value: int | float | None
     bound: int | float | None
@@ -148,6 +148,7 @@ class Judged(Struct, frozen=True, kw_only=True):
     actions: ActionsDocument
     intermediates: list[IntermediateDocument]
     determinism: Determinism
+    decides: str = "actions"  # what is held to the bound; "logits" of models that write their actions as tokens
 
 
 class Latency(Struct, frozen=True):

@@ -19,7 +19,7 @@ from turbopi.verify.document import ErrorsDocument, finite
 
 _PREFIX = ("prefix_pad_mask", "prefix_positions", "vision_last_hidden", "prefix_embs")
 BY_LAYER = ("kv_k", "kv_v")
-_BY_STEP = ("cond", "x_t", "expert_hidden_step0", "suffix_out", "v_t")  # in a step, in this order
+_BY_STEP = ("cond", "x_t", "expert_hidden_step0", "suffix_out", "v_t", "logits")  # in a step, in this order
 _PER_OBSERVATION = (*_PREFIX, *BY_LAYER)  # the noise doesn't enter these
 _AXIS = {name: "layer" if name in (*BY_LAYER, "expert_hidden_step0") else "step" for name in (*BY_LAYER, *_BY_STEP)}
 

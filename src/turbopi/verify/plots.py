@@ -13,6 +13,7 @@ from turbopi.verify.document import Certificate, IntermediateDocument, Number
 # tensor -> label and colour: the stage's, and a darker one
 _BY_LAYER = {"kv_k": ("K", STAGES["prefix"]), "kv_v": ("V", "#8c4a1f")}
 _BY_STEP = {"v_t": ("velocity v_t", STAGES["denoise"]), "x_t": ("actions so far x_t", "#2d6a3e")}
+_BY_STEP["logits"] = ("logits", STAGES["denoise"])
 
 
 def write_plots(document: Certificate, folder: Path) -> list[Path]:
@@ -34,7 +35,7 @@ def _plot(document: Certificate, names: dict[str, tuple[str, str]], axis: str, p
         erring = [row for row in rows if _control(row) or row.relative_rms]  # x_t begins as the noise itself
         allowed = [row.allowed for row in erring]
         _line(axes, [row.index for row in erring], allowed, color, ":", f"{label}, allowed (informative)")
-    if names is _BY_STEP:
+    if names is _BY_STEP and document.decides == "actions":
         _decisive(axes, document)
     if axes.get_lines():
         axes.set_yscale("log")

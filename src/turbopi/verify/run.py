@@ -22,6 +22,7 @@ from turbopi.calibrate.run import Progress
 from turbopi.checkpoint import Checkpoint
 from turbopi.checkpoint.calibration import calibration_of
 from turbopi.engine.graph import empty_cache
+from turbopi.models import family_of
 from turbopi.models.pi0 import exact
 from turbopi.policy import shipped
 from turbopi.policy.examples import NoisyExample
@@ -35,7 +36,8 @@ from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, re
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
-_DEMANDED = ("kv_k", "kv_v", "v_t", "actions")  # by the Backend protocol
+_DEMANDED = ("kv_k", "kv_v", "actions")  # by the Backend protocol, and one of _OUTPUTS
+_OUTPUTS = {"v_t", "logits"}  # of a flow's evaluations; of tokens
 
 
 # -- the run -----------------------------------------------------------------------------------------------------------
@@ -58,6 +60,9 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
     rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)
     quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
+    if checkpoint.format != "random" and family_of(checkpoint.config.model).reader is not None:
+        config = checkpoint.config.with_model(broken_answers="owners")  # it judges numbers, and no robot gets them
+        checkpoint = replace(checkpoint, config=config)
     if arguments.get("robot") is None:
         checkpoint = shipped.with_libero_stats(checkpoint)
     if quantization is not None:
@@ -115,7 +120,7 @@ class _Reference:
             checkpoint, **(dict(arguments) | {"backend": "pytorch", "precision": "f32"})
         )
         policy, self.device = self._policy, arguments["device"]
-        self.steps = int(policy.metadata["num_denoising_steps"])
+        self.steps = int(policy.metadata.get("max_decoding_steps") or policy.metadata["num_denoising_steps"])
         self._pipeline = policy.pipeline
         self.examples = list(read_examples(policy, plan))
         self.calls = make_calls(policy, self.examples, plan)
@@ -205,6 +210,7 @@ def _run(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> Tensors:
     observation = call.observation
     trace = policy.backend.intermediates(observation, call.noise, steps, **policy.loop_arguments)
     missing = [name for name in _DEMANDED if name not in trace]
+    missing += [] if trace.keys() & _OUTPUTS else sorted(_OUTPUTS, reverse=True)[:1]
     if missing:
         raise BackendError(f"backend {policy.backend.name!r} doesn't expose {', '.join(missing)}; it can't be verified")
     tensors = tensors_of(trace, call.example.inputs, with_prefix=call.first)

@@ -40,7 +40,7 @@ from turbopi.verify.document import (
 )
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 
-ACTIONS = Place("actions")
+ACTIONS, LOGITS = Place("actions"), "logits"
 Control = Literal["bf16", "jitter"]
 
 
@@ -117,6 +117,8 @@ class Compared:
     by_call: list[tuple[NoisyExample, Errors]] = field(default_factory=list)  # actions
     deltas: Errors = field(default_factory=Errors)  # what denoising did: actions less noise
     exact: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # the reference's actions, the noise
+    logits: Errors = field(default_factory=Errors)  # of all steps, of models that write their actions as tokens
+    spread: float = 0.0  # of the reference's logits, over their rms
 
     def add(
         self, call: NoisyExample, tensors: Tensors, exact: Tensors, robot: np.ndarray, exact_robot: np.ndarray
@@ -129,6 +131,9 @@ class Compared:
                     f"{place} has shape {list(ours.shape)}, the reference's {list(theirs.shape)}: can't be compared"
                 )
             self.by_place.setdefault(place, Errors()).add(ours, theirs)
+            if place.name == LOGITS:
+                self.logits.add(ours, theirs)
+                self.spread = max(self.spread, float(theirs.std() / (np.sqrt(np.square(theirs).mean()) or 1.0)))
         of_call = Errors()
         of_call.add(tensors[ACTIONS], exact[ACTIONS])
         self.by_call.append((call, of_call))
@@ -144,8 +149,19 @@ class Compared:
         return self.by_place[ACTIONS]
 
     @property
+    def decides(self) -> str:
+        """What is held to the bound. A token is chosen or isn't: its logits say how near that was."""
+        return LOGITS if self.logits.calls else "actions"
+
+    @property
+    def deciding(self) -> Errors:
+        return self.logits if self.logits.calls else self.actions
+
+    @property
     def has_signal(self) -> bool:
-        """Whether the reference's actions can tell a right backend from a wrong one."""
+        """Whether the reference's numbers that decide can tell a right backend from a wrong one."""
+        if self.logits.calls:
+            return self.spread > 1e-6
         actions, noise = (np.concatenate(some) for some in zip(*self.exact, strict=True))
         return has_signal(actions, noise)
 
@@ -174,8 +190,8 @@ def judge(
         place: rule.allowed(precision, plain[place].relative_rms if place in plain else 0.0)
         for place in compared.by_place
     }
-    limit = rule.limit(control.actions.relative_rms)
-    allowed[ACTIONS] = limit
+    limit = rule.limit(control.deciding.relative_rms)
+    allowed[ACTIONS] = limit if compared.decides == "actions" else np.inf
     suspect = first_suspect(compared.by_place, plain, allowed, JUMP)
     checks = _checks(rule, limit, compared, control, repetition)
     failed = [check for check in checks if not check.ok]
@@ -184,6 +200,7 @@ def judge(
         verdict += f"; first off: {suspect}"
     return Judged(
         ok=not failed,
+        decides=compared.decides,
         verdict=f"{'FAIL' if failed else 'PASS'}: {verdict}",
         checks=checks,
         bounds=Bounds(
@@ -213,15 +230,15 @@ def judge(
 
 def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, repetition: Repetition) -> list[Check]:
     """What decides, the actions first."""
-    error, plain = compared.actions.relative_rms, control.actions.relative_rms
+    error, plain, what = compared.deciding.relative_rms, control.deciding.relative_rms, compared.decides
     stated = "the bound that was given" if rule.overridden else "the stated bound"
     origin = f"{rule.factor:g} x the control's {significant(plain)}" if rule.bound is None else stated
     ok = bool(error <= limit)
     relation = "within" if ok else "not within"
-    if compared.actions.finite:
-        text = f"actions' relative rms {significant(error)} is {relation} {significant(limit)} ({origin})"
+    if compared.deciding.finite:
+        text = f"{what}' relative rms {significant(error)} is {relation} {significant(limit)} ({origin})"
     else:
-        text = "the actions aren't finite"
+        text = f"the {what} aren't finite"
     wrong = [place for place in in_order(compared.by_place) if not compared.by_place[place].finite]
     judged = _signal(rule, limit, compared, control)
     same = repetition.identical == repetition.calls
@@ -233,7 +250,8 @@ def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, rep
     repeated += "" if same else f" (off by up to {significant(repetition.max)})"
     return [
         *([] if judged.ok else [judged]),
-        Check("actions", ok, finite(error), finite(limit), text),
+        Check(what, ok, finite(error), finite(limit), text),
+        *([] if what == "actions" else [_answers(compared)]),
         *([] if rule.cosine is None else [of_deltas]),
         Check("finite", not wrong, len(wrong), 0, values),
         Check("determinism", same, repetition.calls - repetition.identical, 0, repeated),
@@ -241,16 +259,23 @@ def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, rep
     ]
 
 
+def _answers(compared: Compared) -> Check:
+    """Informs: where two ids are near each other, rounding may choose the other one."""
+    same, calls = sum(errors.max == 0 for _, errors in compared.by_call), len(compared.by_call)
+    return Check("answers", True, same, calls, f"{same} of {calls} answers give the reference's actions exactly")
+
+
 def _signal(rule: Rule, limit: float, compared: Compared, control: Compared) -> Check:
     """Whether there is anything that could fail: a reference that varies, and a control that gives a bound."""
     why = ""
     if not compared.has_signal:
         why = NO_SIGNAL
-    elif rule.bound is None and not control.actions.finite:
-        why = "the control's actions aren't finite, so there is no bound"
+    elif rule.bound is None and not control.deciding.finite:
+        why = f"the control's {control.decides} aren't finite, so there is no bound"
     elif rule.bound is None and not limit > 0:
         why = "the control has no error, so there is no bound"
-    return Check("signal", not why, None, None, f"nothing to judge: {why}" if why else "the reference's actions vary")
+    varies = f"the reference's {compared.decides} vary"
+    return Check("signal", not why, None, None, f"nothing to judge: {why}" if why else varies)
 
 
 def _actions(robot: str, compared: Compared, control: Compared) -> ActionsDocument:

@@ -14,7 +14,7 @@ PI05 = Family(
     modulated=True,
     state_token=False,
     marks=("time_mlp_in", "time_mlp_", "expert.norm.dense."),
-    state_in_prompt=True,
+    state_step="pi05_prepare_state_tokenizer_processor_step",
     prompt_tokens=200,
 )
 PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False)
@@ -27,6 +27,6 @@ PI0 = Family(
     modulated=False,
     state_token=True,
     marks=("state_proj", "action_time_mlp_"),
-    state_in_prompt=False,
+    state_step=None,
     prompt_tokens=48,
 )

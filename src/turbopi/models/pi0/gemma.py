@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from turbopi.config import GemmaConfig, ModelConfig
+from turbopi.config import GemmaConfig
 from turbopi.models.pi0.layers import (
     AdaRMSNorm,
     GeGLU,
@@ -67,10 +67,10 @@ class Gemma(nn.Module):
 
     layers: Sequence[Layer]
 
-    def __init__(self, model: ModelConfig, config: GemmaConfig, *, vocab_size: int | None, adaptive: bool) -> None:
+    def __init__(self, config: GemmaConfig, *, eps: float, vocab_size: int | None, adaptive: bool) -> None:
         super().__init__()
         if vocab_size is not None:
             self.embed_tokens = nn.Embedding.from_pretrained(torch.empty(vocab_size, config.width))  # type: ignore[no-untyped-call]
-        layers = (Layer(config, model.rms_norm_eps, adaptive) for _ in range(config.depth))
+        layers = (Layer(config, eps, adaptive) for _ in range(config.depth))
         self.layers = nn.ModuleList(layers)  # type: ignore[assignment]
-        self.norm = (AdaRMSNorm if adaptive else RMSNorm)(config.width, model.rms_norm_eps)
+        self.norm = (AdaRMSNorm if adaptive else RMSNorm)(config.width, eps)

@@ -60,8 +60,9 @@ class Pi0Model(nn.Module):
         width, dim = config.expert.width, config.action_dim
         self.vision = VisionTower(config.vision)
         self.projector = nn.Linear(config.vision.width, config.vlm.width)
-        self.vlm = Gemma(config, config.vlm, vocab_size=config.vocab_size, adaptive=False)
-        self.expert = Gemma(config, config.expert, vocab_size=None, adaptive=config.kind == "pi05")
+        eps, adaptive = config.rms_norm_eps, config.kind == "pi05"
+        self.vlm = Gemma(config.vlm, eps=eps, vocab_size=config.vocab_size, adaptive=False)
+        self.expert = Gemma(config.expert, eps=eps, vocab_size=None, adaptive=adaptive)
         self.action_in_proj = nn.Linear(dim, width)
         self.action_out_proj = nn.Linear(width, dim)
         if config.kind == "pi05":

@@ -9,27 +9,19 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from turbopi.config import Owner
+from turbopi.models.family import Pieces
 from turbopi.support.errors import ActionError, TokenizerError
 from turbopi.support.reading import Fields, read_json
 
-Owner = Literal["openpi", "lerobot"]
-END = "|"
+BEGINNING, END = "Action: ", "|"
+SETTINGS = "processor_config.json"
 _LAYOUTS = ("bpe_tokenizer/tokenizer.json", "tokenizer.json")  # of transformers 5; as published
 _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
-
-
-class Pieces(Protocol):
-    """PaliGemma's tokenizer; `sentencepiece.SentencePieceProcessor` is one."""
-
-    def id_to_piece(self, id: int) -> str: ...
-    def encode(self, text: str) -> list[int]: ...
-    def decode(self, ids: list[int]) -> str: ...
-    def vocab_size(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -49,10 +41,10 @@ class FastTokenizer:
     def from_folder(cls, folder: Path) -> "FastTokenizer":
         """Raises TokenizerError for a folder without the two files, or with damaged ones."""
         found = next((folder / name for name in _LAYOUTS if (folder / name).is_file()), None)
-        settings = folder / "processor_config.json"
+        settings = folder / SETTINGS
         if found is None or not settings.is_file():
             raise TokenizerError(
-                f"{folder} is no FAST action tokenizer: it needs processor_config.json, and {' or '.join(_LAYOUTS)}"
+                f"{folder} is no FAST action tokenizer: it needs {SETTINGS}, and {' or '.join(_LAYOUTS)}"
             )
         fields = Fields(read_json(settings, TokenizerError), settings, TokenizerError)
         scale, min_token = fields.number("scale"), fields.integer("min_token", -(2**20), 2**20)
@@ -69,16 +61,16 @@ class FastTokenizer:
         Raises ActionError for a code below 0.
         """
         if any(code < 0 for code in codes):
-            raise ActionError(f"the answer has the code {min(codes)}: codes are 0 or more")
+            raise ActionError(f"it has the code {min(codes)}: codes are 0 or more")
         return b"".join(self.pieces.get(code, b"") for code in codes).decode("utf-8", errors="replace")
 
     def actions(self, text: str, horizon: int, dim: int) -> NDArray[np.float64]:
         """float64[H, d] of a string of H * d characters. Raises ActionError for another length, or a cut character."""
         if _REPLACEMENT in text:
-            raise ActionError("the answer has a cut character, which would be an action of thousands")
+            raise ActionError("it has a cut character, which would be an action of thousands")
         if len(text) != horizon * dim:
             raise ActionError(
-                f"the answer has {len(text)} coefficients, and {horizon} actions of {dim} values have {horizon * dim}"
+                f"it has {len(text)} coefficients, and {horizon} actions of {dim} values have {horizon * dim}"
             )
         return self.transformed(text, horizon, dim)
 
@@ -123,13 +115,13 @@ def codes_of(ids: Sequence[int], owner: Owner, pieces: Pieces, skip: int = 128, 
     top = pieces.vocab_size() - 1 - skip
     if owner == "openpi":
         text = pieces.decode(list(ids))
-        if "Action: " not in text:
-            raise ActionError(f"the answer doesn't say 'Action: ': {text[:80]!r}")
-        between = text.split("Action: ")[1].split(END)[0].strip()
+        if BEGINNING not in text:
+            raise ActionError(f"it doesn't say {BEGINNING!r}, but {text[:80]!r}")
+        between = text.split(BEGINNING)[1].split(END)[0].strip()
         return [top - number for number in pieces.encode(between)]
     words = [pieces.id_to_piece(number) for number in ids]
     if prefix and words[:2] != ["Action", ":"]:
-        raise ActionError(f"the answer begins with {words[:2]}, not with 'Action', ':'")
+        raise ActionError(f"it begins with {words[:2]}, not with 'Action', ':'")
     end = words.index(END) if END in words else len(words)
     kept: list[int] = []
     at = 0

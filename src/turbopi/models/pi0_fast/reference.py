@@ -1,21 +1,29 @@
 """The reference: Pi0-FAST in plain PyTorch, exact to its owners' greedy decoding.
 
-    prefill(inputs) -> Decoding        images and prompt, once an observation
-    decode(decoding, steps) -> ids     one token after the other, until the stop
+    begin(observation, decoding)  images and prompt, once an observation, and the answer's first id
+    step(decoding)                one more id
+    generate(observation, …)      both, until the answer is over
 
 It is Pi0's vision tower, projector and language model without the action expert; a token's logits are the final norm's
 output times the embedding table. openpi and LeRobot run it differently, see `FastRules`.
 
-Shapes: B batch, C cameras, P prompt places, S prefix places, V vocabulary, D width.
+Keys, values and all else that a step reads or writes are buffers of a fixed size, counters among them, so that a step
+can be captured once and replayed. It never waits for the device.
+
+Shapes: B batch, C cameras, P prompt places, S prefix places, N tokens of an answer at most, V vocabulary, D width, G
+key/value heads, K head_dim.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from turbopi.config import ModelConfig
+from turbopi.config import Owner, Pi0FastConfig
+from turbopi.models.family import AnswerReader
+from turbopi.models.observation import Observation
 from turbopi.models.pi0.exact import exact_float32
 from turbopi.models.pi0.gemma import Gemma
 from turbopi.models.pi0.layers import gated_residual, rope_tables
@@ -24,8 +32,9 @@ from turbopi.models.pi0.vision import VisionTower
 
 BOS = 2  # of PaliGemma's SentencePiece model
 
-# Names of what a trace records: prefix_embeddings [B, S, D], prefix_pad bool[B, S], prefix_positions int[B, S],
-# decode_positions int[N]: of the last prefix token and of each decoded one, logits [N, B, V], margins [N, B]
+# Names of what a trace records: prefix_embs [B, S, D], prefix_pad_mask bool[B, S], prefix_positions int[B, S],
+# kv_k, kv_v [L, B, C * 256 + P, G, K], decode_positions int[N]: of the last prefix token and of each decoded one,
+# logits [N, B, V]
 Trace = dict[str, Tensor]
 
 
@@ -42,135 +51,223 @@ class FastRules:
     skipped: int
 
 
-LEROBOT = FastRules(bos_after_prompt=True, skipped=0)
-OPENPI = FastRules(bos_after_prompt=False, skipped=1)
+RULES: dict[Owner, FastRules] = {
+    "lerobot": FastRules(bos_after_prompt=True, skipped=0),
+    "openpi": FastRules(bos_after_prompt=False, skipped=1),
+}
 
 
 @dataclass(frozen=True)
-class FastInputs:
-    """What the network takes of B observations.
-
-    images  (uint8 [0, 255] | float32 [-1, 1])[B, C, 224, 224, 3], image_mask bool[B, C]
-    tokens  int64[B, P], padded at the right, token_mask bool[B, P]
-    """
-
-    images: Tensor
-    image_mask: Tensor
-    tokens: Tensor
-    token_mask: Tensor
-
-
-@dataclass
 class Decoding:
-    """A prefix's keys and values [B, G, S, K] by layer, which grow by each decoded token, and what comes next.
+    """An answer as it grows, in place.
 
-    valid     bool[B, S]
-    position  int64[B], of the next decoded token
-    logits    float32[B, V], which it is chosen by
+    keys, values  [B, G, S + N, K] by layer
+    valid         bool[B, S + N]   what a token may attend to
+    ids           int64[B, N]      written so far: `count` int64[1] of them
+    chosen        int64[B]         the last one
+    place         int64[1]         of its keys and values; `position` int64[B]: for RoPE
+    logits        float32[B, V]    by which it was chosen
+    ends, ended   int64[E], bool[B]  whether one of `ends` was written
     """
 
-    keys: list[Tensor]
-    values: list[Tensor]
+    keys: tuple[Tensor, ...]
+    values: tuple[Tensor, ...]
     valid: Tensor
+    ids: Tensor
+    count: Tensor
+    chosen: Tensor
+    place: Tensor
     position: Tensor
     logits: Tensor
+    ends: Tensor
+    ended: Tensor
+
+    def rows(self, reader: AnswerReader, most: int) -> list[list[int]] | None:
+        """The answers, each to its end or `most` ids; None while one isn't over. Waits for the device."""
+        written = self.ids[:, : min(int(self.count), most)].tolist()
+        rows = [_to_its_end(row, reader) for row in written]
+        if len(written[0]) < most and any(row is None for row in rows):
+            return None
+        return [ids if row is None else row for row, ids in zip(rows, written, strict=True)]
+
+
+def _to_its_end(ids: list[int], reader: AnswerReader) -> list[int] | None:
+    for at, one in enumerate(ids, 1):
+        if one in reader.ends and reader.over(ids[:at]):
+            return ids[:at]
+    return None
 
 
 class Pi0FastModel(nn.Module):
-    """`config`'s expert and action_dim are unused. Build it on the meta device and load a checkpoint's tensors."""
+    """Build it on the meta device and load a checkpoint's tensors."""
 
-    def __init__(self, config: ModelConfig, rules: FastRules) -> None:
+    def __init__(self, config: Pi0FastConfig) -> None:
         super().__init__()
-        self.config, self.rules = config, rules
+        self.config, self.rules = config, RULES[config.owner]
         self.vision = VisionTower(config.vision)
         self.projector = nn.Linear(config.vision.width, config.vlm.width)
-        self.vlm = Gemma(config, config.vlm, vocab_size=config.vocab_size, adaptive=False)
+        self.vlm = Gemma(config.vlm, eps=config.rms_norm_eps, vocab_size=config.vocab_size, adaptive=False)
 
     @classmethod
-    def from_state(cls, config: ModelConfig, rules: FastRules, state: dict[str, Tensor]) -> "Pi0FastModel":
+    def from_state(cls, config: Pi0FastConfig, state: dict[str, Tensor]) -> "Pi0FastModel":
         """The model around tensors of Pi0's canonical names that are already on their device; none is copied."""
         with torch.device("meta"):
-            model = cls(config, rules)
+            model = cls(config)
         model.load_state_dict(state, strict=True, assign=True)
         return model.eval().requires_grad_(False)
+
+    @property
+    def device(self) -> torch.device:
+        return self.projector.weight.device
 
     @torch.no_grad()
     @exact_float32()
     def generate(
-        self, inputs: FastInputs, steps: int, stop: Sequence[int], *, trace: Trace | None = None
+        self,
+        observation: Observation,
+        reader: AnswerReader,
+        steps: int,
+        *,
+        trace: Trace | None = None,
+        forced: Sequence[int] | None = None,
+        mark: Callable[[str], None] = lambda stage: None,
     ) -> list[list[int]]:
-        """The ids that each row writes, greedily, to its first id of `stop`, with it, or `steps` of them.
+        """The ids that each row writes, greedily, until the reader says that it is over, or `steps` of them.
 
-        What an owner writes behind `|` is dropped when its answer is read, so stopping there changes no action.
+        forced  ids that take the places of those that were chosen, to compare logits
+        mark    is called at the ends of "vision", "prefix" and "denoise"
         """
-        decoding = self.prefill(inputs, trace=trace)
-        rows: list[list[int]] = [[] for _ in range(inputs.tokens.shape[0])]
-        positions, logits = [decoding.position - 1 - self.rules.skipped], []
-        for step in range(steps):
-            logits.append(decoding.logits)
-            chosen = decoding.logits.argmax(-1)
-            for row, number in zip(rows, chosen.tolist(), strict=True):
-                if not row or row[-1] not in stop:
-                    row.append(number)
-            if step + 1 == steps or all(row[-1] in stop for row in rows):
+        decoding = self.allocate(observation, steps, reader.ends)
+        embedded = self.embed_images(observation.images)
+        mark("vision")
+        self.begin(observation, decoding, embedded=embedded, trace=trace)
+        mark("prefix")
+        positions, logits = [decoding.position - 1 - self.rules.skipped], [decoding.logits.clone()]
+        written = 1
+        while True:
+            over = written == steps or (forced is None and bool(decoding.ended.any()))
+            if over and (rows := decoding.rows(reader, steps)) is not None:
                 break
-            positions.append(decoding.position)
-            self.append(decoding, chosen)
+            if forced is not None:
+                decoding.chosen.fill_(forced[written - 1])
+            if trace is not None:
+                positions.append(decoding.position.clone())
+            self.step(decoding)
+            written += 1
+            if trace is not None:
+                logits.append(decoding.logits.clone())
+        mark("denoise")
         if trace is not None:
-            best = torch.stack(logits).topk(2).values
-            trace |= {"logits": torch.stack(logits), "margins": best[..., 0] - best[..., 1]}
-            trace["decode_positions"] = torch.stack(positions)
+            trace |= {"logits": torch.stack(logits), "decode_positions": torch.stack(positions)}
         return rows
 
-    @torch.no_grad()
-    @exact_float32()
-    def prefill(self, inputs: FastInputs, *, trace: Trace | None = None) -> Decoding:
-        """Keys and values of images and prompt, which see each other wherever they are valid."""
-        images, _ = embed_images(self.vision, self.projector, inputs.images)
-        per_image = images.shape[1] // inputs.image_mask.shape[1]
-        parts = [images, embed_prompt(self.vlm, inputs.tokens)]
-        masks = [inputs.image_mask.repeat_interleave(per_image, dim=1), inputs.token_mask]
+    def allocate(self, observation: Observation, steps: int, ends: Sequence[int]) -> Decoding:
+        """Buffers for observations of this shape, answers of at most `steps` tokens, and ids that end them."""
+        b, c = observation.image_mask.shape
+        prefix = c * self.config.vision.num_tokens + observation.tokens.shape[1] + self.rules.bos_after_prompt
+        of, device = self.config.vlm, self.device
+        shape, dtype = (b, of.num_kv_heads, prefix + steps, of.head_dim), self.projector.weight.dtype
+
+        def caches() -> tuple[Tensor, ...]:
+            return tuple(torch.zeros(shape, dtype=dtype, device=device) for _ in range(of.depth))
+
+        def whole(*size: int) -> Tensor:
+            return torch.zeros(size, dtype=torch.int64, device=device)
+
+        return Decoding(
+            caches(),
+            caches(),
+            valid=torch.zeros(b, prefix + steps, dtype=torch.bool, device=device),
+            ids=whole(b, steps),
+            count=whole(1),
+            chosen=whole(b),
+            place=whole(1),
+            position=whole(b),
+            logits=torch.zeros(b, self.config.vocab_size, device=device),
+            ends=torch.tensor(list(ends), dtype=torch.int64, device=device),
+            ended=torch.zeros(b, dtype=torch.bool, device=device),
+        )
+
+    def embed_images(self, images: Tensor) -> Tensor:
+        """(uint8 [0, 255] | float32 [-1, 1])[B, C, 224, 224, 3] -> [B, C * 256, D]"""
+        return embed_images(self.vision, self.projector, images)[0]
+
+    def begin(
+        self,
+        observation: Observation,
+        decoding: Decoding,
+        *,
+        embedded: Tensor | None = None,
+        trace: Trace | None = None,
+    ) -> None:
+        """Keys and values of images and prompt, which see each other wherever they are valid; and the first id.
+
+        embedded  what `embed_images` made of the images
+        """
+        images = self.embed_images(observation.images) if embedded is None else embedded
+        per_image = images.shape[1] // observation.image_mask.shape[1]
+        parts = [images, embed_prompt(self.vlm, observation.tokens)]
+        masks = [observation.image_mask.repeat_interleave(per_image, dim=1), observation.token_mask]
         if self.rules.bos_after_prompt:
-            bos = inputs.tokens.new_full((inputs.tokens.shape[0], 1), BOS)
+            bos = torch.full_like(observation.tokens[:, :1], BOS)
             parts.append(embed_prompt(self.vlm, bos))
             masks.append(torch.ones_like(bos, dtype=torch.bool))
         x, valid = torch.cat(parts, dim=1), torch.cat(masks, dim=1)
-        positions = valid.long().cumsum(1) - 1
+        positions, prefix, mask = valid.long().cumsum(1) - 1, valid.shape[1], valid[:, None, None, :]
         if trace is not None:
-            trace |= {"prefix_embeddings": x, "prefix_pad": valid, "prefix_positions": positions}
-        keys, values, x = self._run(x, positions, valid[:, None, None, :], None)
-        last = torch.arange(valid.shape[1], device=valid.device).where(valid, -1).amax(1)
-        logits = self._logits(x[torch.arange(x.shape[0], device=x.device), last])
-        return Decoding(keys, values, valid, valid.sum(1) + self.rules.skipped, logits)
-
-    @torch.no_grad()
-    @exact_float32()
-    def append(self, decoding: Decoding, ids: Tensor) -> None:
-        """Decode one more token: ids int64[B] are what was chosen by `decoding.logits`."""
-        decoding.valid = torch.cat((decoding.valid, torch.ones_like(decoding.valid[:, :1])), dim=1)
-        mask, positions = decoding.valid[:, None, None, :], decoding.position[:, None]
-        decoding.keys, decoding.values, x = self._run(embed_prompt(self.vlm, ids[:, None]), positions, mask, decoding)
-        decoding.position = decoding.position + 1
-        decoding.logits = self._logits(x[:, -1])
-
-    def _run(
-        self, x: Tensor, positions: Tensor, mask: Tensor, before: Decoding | None
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """All layers over x [B, T, D] behind what came before -> keys and values by layer, the final norm's output."""
+            trace |= {"prefix_embs": x, "prefix_pad_mask": valid, "prefix_positions": positions}
         rope = rope_tables(positions, self.config.vlm.head_dim, self.config.rope_base)
-        keys, values = [], []
-        for number, layer in enumerate(self.vlm.layers):
+        for layer, keys, values in zip(self.vlm.layers, decoding.keys, decoding.values, strict=True):
             normed, gate = layer.input_layernorm(x)
             k, v = layer.keys_values(normed, rope)
-            if before is not None:
-                k, v = torch.cat((before.keys[number], k), dim=2), torch.cat((before.values[number], v), dim=2)
-            keys.append(k)
-            values.append(v)
+            keys[:, :, :prefix].copy_(k)
+            values[:, :, :prefix].copy_(v)
             x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, k, v, mask), gate))
-        normed, _ = self.vlm.norm(x)
-        return keys, values, normed
+        if trace is not None:
+            rows = prefix - self.rules.bos_after_prompt
+            for name, caches in (("kv_k", decoding.keys), ("kv_v", decoding.values)):
+                trace[name] = torch.stack([one[:, :, :rows].transpose(1, 2) for one in caches])
+        decoding.valid.zero_()
+        decoding.valid[:, :prefix].copy_(valid)
+        decoding.count.zero_()
+        decoding.ended.zero_()
+        decoding.place.fill_(prefix)
+        decoding.position.copy_(valid.sum(1) + self.rules.skipped)
+        last = torch.arange(prefix, device=x.device).where(valid, -1).amax(1)
+        self._choose(decoding, x.gather(1, last[:, None, None].expand(-1, 1, x.shape[2])))
 
-    def _logits(self, hidden: Tensor) -> Tensor:
-        """[B, D] -> float32[B, V]"""
+    def step(self, decoding: Decoding) -> None:
+        """Run the last id and choose the next one. At most N - 1 times after `begin`."""
+        x = embed_prompt(self.vlm, decoding.chosen[:, None])
+        decoding.valid.index_fill_(1, decoding.place, True)
+        mask = decoding.valid[:, None, None, :]
+        rope = rope_tables(decoding.position[:, None], self.config.vlm.head_dim, self.config.rope_base)
+        for layer, keys, values in zip(self.vlm.layers, decoding.keys, decoding.values, strict=True):
+            normed, gate = layer.input_layernorm(x)
+            k, v = layer.keys_values(normed, rope)
+            keys.index_copy_(2, decoding.place, k)
+            values.index_copy_(2, decoding.place, v)
+            x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, keys, values, mask), gate))
+        decoding.place.add_(1)
+        decoding.position.add_(1)
+        self._choose(decoding, x)
+
+    def _choose(self, decoding: Decoding, x: Tensor) -> None:
+        """The next id, by the last layer's output [B, 1, D]."""
         weight = self.vlm.embed_tokens.weight
-        return (hidden.to(weight.dtype) @ weight.T).float()
+        hidden = self.vlm.norm(x)[0][:, 0].to(weight.dtype)
+        decoding.logits.copy_(hidden @ weight.T)
+        decoding.chosen.copy_(decoding.logits.argmax(-1))
+        decoding.ids.index_copy_(1, decoding.count, decoding.chosen[:, None])
+        decoding.ended.logical_or_((decoding.chosen[:, None] == decoding.ends).any(1))
+        decoding.count.add_(1)
+
+
+def compacted(observation: Observation) -> Observation:
+    """One observation without masked cameras and the prompt's padding: exact, as nothing sees these. Waits for the
+    device.
+    """
+    cameras, tokens = observation.image_mask[0], observation.token_mask[0]
+    kept: dict[str, Any] = {"images": observation.images[:, cameras], "image_mask": observation.image_mask[:, cameras]}
+    kept |= {"tokens": observation.tokens[:, tokens], "token_mask": observation.token_mask[:, tokens]}
+    return Observation(**kept, state=observation.state)
