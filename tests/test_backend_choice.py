@@ -1,12 +1,15 @@
 """What "auto" stands for, and that it says why."""
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
 
 from turbopi import backends
 from turbopi.backends.fused import FusedBackend
+from turbopi.config import PRESETS, MemoryConfig
+from turbopi.models.smolvla.family import BASE
 from turbopi.support.errors import BackendUnavailable
 
 GPU = torch.device("cuda", 0)
@@ -109,3 +112,20 @@ def test_int8_runs_where_fp8_does_not(
 def test_int8_on_a_cpu_names_the_emulation() -> None:
     with pytest.raises(BackendUnavailable, match=r"compute capability 8\.0 to 8\.7; .* backend 'emulated_int8'"):
         backends.check("fused", torch.device("cpu"), "int8")
+
+
+def test_auto_takes_for_a_model_what_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, {})
+    smolvla, fast, remembering = (
+        BASE.model,
+        PRESETS["pi0_fast_base"].model,
+        replace(PRESETS["pi05_base"].model, memory=MemoryConfig(visual=True, proprioceptive=False)),
+    )
+    assert backends.choose(GPU, model=smolvla)[0] == "fused"
+    assert backends.choose(GPU, "f32", model=smolvla)[0] == "cuda_graph"
+    narrow = replace(smolvla, text=replace(smolvla.text, width=120, head_dim=8))  # type: ignore[attr-defined]
+    name, said = backends.choose(GPU, model=narrow)
+    assert name == "cuda_graph" and "heads are narrower than a tensor core's 16 columns" in said
+    for model in (fast, remembering):
+        name, said = backends.choose(GPU, model=model)
+        assert name == "cuda_graph" and "not fused" in said

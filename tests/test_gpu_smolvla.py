@@ -103,9 +103,10 @@ def policies(published: Checkpoint) -> dict[str, UnifiedPolicy]:
 
 def seen(policy: UnifiedPolicy, seed: int, cameras: int, prompt: str) -> dict[str, Any]:
     observation = policy.example_observation(seed)
-    names = [name for name, value in observation.items() if isinstance(value, np.ndarray) and value.ndim == 3]
-    left = {name: value for name, value in observation.items() if name not in names[cameras:]}
-    return {**left, "prompt": prompt}
+    (folder,) = {"image", "images"} & observation.keys()
+    left = dict(list(observation[folder].items())[:cameras])
+    assert len(left) == cameras
+    return {**observation, folder: left, "prompt": prompt}
 
 
 @pytest.mark.parametrize(("cameras", "prompt"), [(1, "a"), (2, "put the red cup on the plate " * 3), (3, "open it")])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from pi0_fast_golden import GOLDEN, RUNS, TOKENIZER, make_folder, make_hub, policy_of, runs
+from replayed_graphs import Replayed, replay_on_cpu
 from safetensors.numpy import load_file, save_file
 from smolvla_golden import relative
 from typer.testing import CliRunner, Result
 
 from turbopi import UnifiedPolicy
-from turbopi.backends import captured, tokens
-from turbopi.backends.captured import CapturedBackend
+from turbopi.backends import tokens
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.cli import app
 from turbopi.config import PRESETS
@@ -225,31 +224,9 @@ def test_a_server_goes_on_behind_a_broken_answer(folders: Path, caplog: pytest.L
 # -- the captured decoding, on a CPU -----------------------------------------------------------------------------------
 
 
-class _Replayed:
-    """A graph that runs its function again at each launch, after what capturing does: that it was run before."""
-
-    launches = 0
-
-    def __init__(self, run: Any, *places: Any) -> None:
-        self._run = run
-        for _ in range(3):
-            run(lambda stage: None)
-
-    def launch(self) -> None:
-        _Replayed.launches += 1
-        self._run(lambda stage: None)
-
-
 @pytest.fixture
 def cuda_graph(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (captured, tokens):
-        monkeypatch.setattr(module, "Graph", _Replayed)
-    monkeypatch.setattr(captured, "building", lambda device: nullcontext())
-    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: None)
-    monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
-    monkeypatch.setattr(CapturedBackend, "unavailable", classmethod(lambda cls, device: None))
-    monkeypatch.setattr("turbopi.backends.cuda_graph.CudaGraphBackend.unavailable", classmethod(lambda *_: None))
-    monkeypatch.setattr(captured.PyTorchCompileBackend, "unavailable", classmethod(lambda cls, device: "not here"))
+    replay_on_cpu(monkeypatch)
 
 
 @pytest.mark.parametrize("name", ["base", "quantiles_empty_camera", "openpi"])
@@ -258,11 +235,11 @@ def test_graphs_write_what_the_reference_writes(folders: Path, cuda_graph: None,
     assert type(policy.backend) is tokens.CapturedTokensBackend
     policy.warmup(cameras=int(golden.expected(0)["image_mask"].sum()))
     for run in (0, 1, 0) if name != "openpi" else (0, 0):
-        before = _Replayed.launches
+        before = Replayed.launches
         answer = policy.infer(golden.observation(run))
         assert relative(answer["actions"], golden.actions(run)) <= 1e-6
         ids = np.trim_zeros(golden.expected(run)["generated"])
-        assert _Replayed.launches - before <= 2 + len(ids) + tokens.LOOK
+        assert Replayed.launches - before <= 2 + len(ids) + tokens.LOOK
     assert set(answer["policy_timing"]) >= {"vision_ms", "prefix_ms", "denoise_ms"}
 
 

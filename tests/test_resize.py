@@ -116,7 +116,7 @@ def test_few_sizes_are_kept_and_those_of_the_last_call_among_them() -> None:
         sizes = [60, size, size + 1, size + 2]
         resizer.upload([camera_image(side, side) for side in sizes], "openpi")
         assert len(resizer._taps) <= MOST_SIZES
-        assert {(side, side, True) for side in sizes} <= set(resizer._taps)
+        assert {(side, side, True, True) for side in sizes} <= set(resizer._taps)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from conftest import golden_model
 from test_engine import static_call
 from torch import Tensor
 
-from turbopi.config import Kind, preset
+from turbopi.config import PRESETS, Kind, preset
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
 from turbopi.engine.call import CallShape, Images
 from turbopi.engine.loops import EulerLoop
@@ -21,6 +21,8 @@ from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.plain_batch import PLAIN_BATCH
 from turbopi.kernels.tile_table import Kernels
+from turbopi.models.smolvla.family import BASE
+from turbopi.support.errors import ConfigError
 from turbopi.tune import shapes
 from turbopi.tune.shapes import Call, calls, distinct, operations
 
@@ -174,3 +176,17 @@ def test_prompts_that_take_the_same_tiles_are_measured_once() -> None:
     assert len({one.key for one in kept}) == len(kept) < len(found)
     assert {one.key.rows for one in kept} == {512, 576, 640, 704, 768}
     assert next(one for one in kept if one.name == "prefix qkv").rows == 560, "the first call's own rows"
+
+
+def test_smolvlas_operations_are_its_towers_and_its_text_layers() -> None:
+    hopper = {one.name: one for one in operations(BASE.model, Call(2, 48), "bf16", "hopper")}
+    fc1, fc2 = hopper["vision fc1"], hopper["vision fc2"]
+    assert (fc1.rows, fc1.columns, fc1.inner, fc1.uses) == (2 * 1024, 3072, 768, 12)
+    assert (fc2.rows, fc2.columns, fc2.inner) == (2 * 1024, 768, 3072)
+    portable = {one.name: one for one in operations(BASE.model, Call(2, 48), "bf16", "portable")}
+    attention = portable["vision attention"]
+    assert (attention.rows, attention.columns, attention.inner, attention.images) == (2 * 1024, 12, 64, 2)
+    assert operations(BASE.model, Call(2, 48), "fp8", "hopper") == []
+    assert operations(BASE.model, Call(2, 48, 4), "bf16", "hopper") == []
+    with pytest.raises(ConfigError, match="Pi0-FAST runs no operations whose tiles can be chosen"):
+        operations(PRESETS["pi0_fast_base"].model, Call(2, 48), "bf16", "hopper")

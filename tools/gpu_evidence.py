@@ -27,7 +27,15 @@ NAME = "gpu_check.json"  # of h200_2026-11-27_gpu_check.json
 PRODUCT = tuple(
     f"src/turbopi/{glob}"
     for glob in (
-        *("kernels/**/*", "engine/*", "models/*", "models/pi0/*", "models/smolvla/*", "backends/*"),
+        *(
+            "kernels/**/*",
+            "engine/*",
+            "models/*",
+            "models/pi0/*",
+            "models/pi0_fast/*",
+            "models/smolvla/*",
+            "backends/*",
+        ),
         *(f"backends/tensorrt/{name}.py" for name in ("backend", "fp8", "pipelined")),
         *("quantization/*", "calibrate/*", "config.py", "verify/check_golden.py"),
     )

@@ -17,6 +17,7 @@ from turbopi.support.reading import is_finite, is_integer, shown
 
 PiKind = Literal["pi05", "pi0"]
 Kind = Literal["pi05", "pi0", "pi0_fast", "smolvla"]
+WITH_MEMORY: tuple[Kind, ...] = ("pi05",)  # LeRobot has `MemoryConfig` in it alone
 FloatPrecision = Literal["bf16", "f32"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 
@@ -195,7 +196,7 @@ class ModelConfig:
             self._check_memory(self.memory)
 
     def _check_memory(self, memory: MemoryConfig) -> None:
-        if self.kind != "pi05" or not (memory.visual or memory.proprioceptive):
+        if self.kind not in WITH_MEMORY or not (memory.visual or memory.proprioceptive):
             raise ConfigError("memory is visual, proprioceptive or both, and of pi05 alone")
         if memory.length > MOST_REMEMBERED:
             raise ConfigError(
@@ -333,16 +334,16 @@ class PolicyConfig:
 
     @property
     def planned_model(self) -> ModelConfig:
-        """`model`, for what the engine plans: kernels, engines, quantization, the roofline.
+        """`model`, for what Pi0 and Pi0.5 alone have: engines, quantization, their own plan and roofline.
 
-        Raises ConfigError for a family that runs as its reference alone.
+        Raises ConfigError for other families.
         """
         if not isinstance(self.model, ModelConfig) or self.model.memory is not None:
             what = f"{self.model.kind}{' with memory' if isinstance(self.model, ModelConfig) else ''}"
             raise ConfigError(
                 f"{self.name} is a {what} policy, and this is for Pi0 and Pi0.5 alone: there are no "
-                f"kernels, engines, calibrations or conversions of a {what} yet. `turbopi infer`, `serve` "
-                "and `inspect` take it, on backends 'pytorch' and 'cuda_graph'"
+                f"engines, calibrations or conversions of a {what} yet. `turbopi infer`, `serve`, `bench`, `verify` "
+                "and `inspect` take it, on the backends that docs/support.md names"
             )
         return self.model
 

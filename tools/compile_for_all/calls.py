@@ -17,6 +17,7 @@ from turbopi.kernels.portable import (
     batch,
     batch_steps,
     embedding,
+    grouped,
     norms,
     quantize,
     resize,
@@ -34,7 +35,7 @@ from turbopi.quantization.fp8 import E4M3, Directions, ScaledMatrix
 BF16, F32 = torch.bfloat16, torch.float32
 Calls = list[Callable[[], Any]]
 Input = dict[str, Any]  # what the operation in front of a matrix is told: see `quantization.fp8.input_of`
-ROWS, PREFIX, SUFFIX = 512, 560, 50
+ROWS, PREFIX, SUFFIX, SMOLVLA_PLACES = 512, 560, 50, 177
 # name, epilogue, rows, out, in, bias, E4M3 or int8 behind it
 PRODUCTS: tuple[tuple[str, tiles.Epilogue, int, int, int, bool, bool], ...] = (
     ("vision's qkv", "plain", ROWS, 3456, 1152, True, False),
@@ -68,6 +69,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_rest(),
         *_backward(),
         *_backward_form(),
+        *_smolvla(target),
     ]
     calls += [partial(_geglu, one) for one in inverses]
     return [*calls, *_weights(), *product_calls(target, numbers, chosen)]
@@ -240,6 +242,32 @@ def _rest() -> Calls:
         lambda: embedding.odd_rows(of(2, 224, 224, 3, dtype=torch.uint8), 14),
         lambda: embedding.add_position(of(ROWS, 1152, dtype=F32), of(256, 1152, dtype=F32), BF16),
         lambda: embedding.embed_prompt(of(48, dtype=torch.int64), of(257152, 2048), of(48, 2048)),
+    ]
+
+
+def _smolvla(target: Target) -> Calls:
+    """Two images of 1,024 patches, which are 64 places each; 48 of the prompt; the state."""
+    heads, groups, width, hidden, places = 15, 5, 960, 2560, SMOLVLA_PLACES
+
+    def layer() -> None:
+        cos, cache = of(places, 32, dtype=F32), of(groups, places, 64)
+        q = grouped.rope_grouped(of(places, (heads + 2 * groups) * 64), cos, cos, cache, cache)
+        grouped.grouped_attention(q, cache, cache, of(1, dtype=torch.int64))
+        grouped.swiglu(of(places, 2 * hidden))
+
+    def rms(y: tuple[int, ...] | None) -> Any:
+        given = None if y is None else of(*y)
+        return norms.residual_rms_norm(of(places, width), given, None, of(width, dtype=F32), None, 1e-5)
+
+    def vision(tile: AttentionTile) -> Tensor:
+        return attention.vision_attention(of(2048, 2304), 2, 12, tile=tile)
+
+    parts: tuple[tuple[int, ...], ...] = ((), (2,), (3,), (4,))
+    return [
+        layer,
+        *(partial(rms, y) for y in (None, *((*one, places, width) for one in parts))),
+        *(partial(_layer_norm, 2048, 768, y, {}) for y in (None, *((*one, 2048, 768) for one in parts))),
+        *(partial(vision, tile) for tile in attention_candidates("vision_attention", target.capability, 64)),
     ]
 
 

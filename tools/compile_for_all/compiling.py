@@ -21,17 +21,20 @@ from triton.runtime.errors import PTXASError
 from triton.runtime.jit import JITFunction
 
 from compile_for_all.allowed import allowed
-from compile_for_all.calls import all_calls
+from compile_for_all.calls import SMOLVLA_PLACES, all_calls
 from compile_for_all.cubin import used
 from compile_for_all.document import Compiled
 from compile_for_all.launches import Launch, launches
 from compile_for_all.targets import MULTIPROCESSORS, Target, over_limit
 from turbopi.config import preset
+from turbopi.engine import smolvla
 from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
-from turbopi.kernels.portable.denoise.packing import WeightNumbers
+from turbopi.kernels.portable.denoise.packing import PI05, Expert, Form, WeightNumbers
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 from turbopi.kernels.sm90.vjp import products as vjp
+from turbopi.models.smolvla.config import SmolVLAConfig
+from turbopi.models.smolvla.family import BASE
 from turbopi.support.errors import BackendError
 from turbopi.support.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
 
@@ -111,7 +114,7 @@ def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes
 
 
 def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
-    """(name, what compiles it): Hopper's for 9.0, and the portable denoising loop of 10 and of 50 actions."""
+    """(name, what compiles it): Hopper's for 9.0, the portable denoising loop of 10 and 50 actions, SmolVLA's."""
     if target.capability == HOPPER:
         yield from ((f"sm90: {name}", make) for name, make in (machine_code.SHAPES | hopper_backward()).items())
     for suffix in (10, 50):
@@ -119,6 +122,7 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
         for weights in numbers:
             label = weights if weights == "bf16" else weights.upper()
             yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
+    yield "SmolVLA's denoise.kernel, H=50, bf16", partial(_smolvla_denoising, target)
 
 
 def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
@@ -146,13 +150,33 @@ def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
 
 
 def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path | None) -> bytes:
+    expert = preset("pi05_libero").planned_model
+    return _loop(target, expert, PI05, machine_code.CACHE_ROWS, suffix, weights, folder)
+
+
+def _smolvla_denoising(target: Target, folder: Path | None) -> bytes:
+    config = BASE.model
+    assert isinstance(config, SmolVLAConfig)
+    return _loop(target, smolvla.ExpertSizes.of(config), smolvla.form(config), SMOLVLA_PLACES, 50, "bf16", folder)
+
+
+def _loop(
+    target: Target,
+    expert: Expert,
+    form: Form,
+    cache_rows: int,
+    suffix: int,
+    weights: WeightNumbers,
+    folder: Path | None,
+) -> bytes:
     sizes = denoise.kernel_sizes(
-        preset("pi05_libero").planned_model,
+        expert,
         blocks=MULTIPROCESSORS[target.capability],
-        cache_rows=machine_code.CACHE_ROWS,
+        cache_rows=cache_rows,
         suffix=suffix,
         weights=weights,
-        choice=denoise.choices(suffix),
+        choice=denoise.choices(suffix, form),
+        form=form,
     )
     assert target.shared >= denoise.SHARED_BYTES, target
     return denoise.compiled(denoise.native_arch(target.capability), sizes, folder=folder)

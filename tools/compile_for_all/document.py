@@ -9,25 +9,15 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document, read_document
 
 
-class _Found(Struct, frozen=True, omit_defaults=True):
-    """What a compiler says. problem: why it isn't fit to run there; refused: why it isn't to run there."""
-
-    registers: int = 0  # a thread
-    spilled: int = 0  # bytes of a thread's stack
-    shared: int = 0  # bytes a block
-    problem: str | None = None
-    refused: str | None = None
-
-
 class Compiled(Struct, frozen=True):
-    """One kernel for one target; the other fields are `_Found`'s."""
+    """One kernel for one target. problem: why it isn't fit to run there; refused: why it isn't to run there."""
 
     kernel: str
     variant: str
     target: str
-    registers: int = 0
-    spilled: int = 0
-    shared: int = 0
+    registers: int = 0  # a thread
+    spilled: int = 0  # bytes of a thread's stack
+    shared: int = 0  # bytes a block
     problem: str | None = None
     refused: str | None = None
 
@@ -40,10 +30,14 @@ class CompiledForAll(Struct, frozen=True):
     rows: list[Compiled]
 
 
-class _Kernel(Struct, frozen=True):
+class _Kernel(Struct, frozen=True, omit_defaults=True):
+    """found: targets by "registers spilled shared", one twice where the variant's name doesn't tell two apart."""
+
     kernel: str
     variant: str
-    targets: dict[str, list[_Found]]  # several where the variant's name doesn't tell them apart
+    found: dict[str, str]
+    problem: dict[str, str] = {}
+    refused: dict[str, str] = {}
 
 
 class _File(Struct, frozen=True):
@@ -57,12 +51,13 @@ class _File(Struct, frozen=True):
 def read_compiled(file: Path) -> CompiledForAll:
     """Raises ConfigError for another file."""
     document = read_document(file, _File, ConfigError)
-    rows = [
-        Compiled(one.kernel, one.variant, target, **structs.asdict(found))
-        for one in document.kernels
-        for target, several in one.targets.items()
-        for found in several
-    ]
+    rows = []
+    for one in document.kernels:
+        for used, targets in one.found.items():
+            registers, spilled, shared = map(int, used.split())
+            for target in targets.split():
+                said = one.problem.get(target), one.refused.get(target)
+                rows.append(Compiled(one.kernel, one.variant, target, registers, spilled, shared, *said))
     return CompiledForAll(document.date, document.versions, rows)
 
 
@@ -85,11 +80,14 @@ def replaced(before: CompiledForAll, now: CompiledForAll, targets: set[str], onl
 
 def written(document: CompiledForAll) -> str:
     """JSON with a line for each kernel and variant: there are hundreds."""
-    kernels: dict[tuple[str, str], dict[str, list[_Found]]] = {}
+    kernels: dict[tuple[str, str], _Kernel] = {}
     for row in document.rows:
-        found = {field: getattr(row, field) for field in _Found.__struct_fields__}
-        kernels.setdefault((row.kernel, row.variant), {}).setdefault(row.target, []).append(_Found(**found))
-    named = (plain_document(_Kernel(*names, targets)) for names, targets in kernels.items())
-    lines = ",\n".join(f"  {json.dumps(one)}" for one in named)
+        one = kernels.setdefault((row.kernel, row.variant), _Kernel(row.kernel, row.variant, {}, {}, {}))
+        used = f"{row.registers} {row.spilled} {row.shared}"
+        one.found[used] = f"{one.found.get(used, '')} {row.target}".strip()
+        for said, why in ((one.problem, row.problem), (one.refused, row.refused)):
+            if why is not None:
+                said[row.target] = why
+    lines = ",\n".join(f"  {json.dumps(plain_document(one))}" for one in kernels.values())
     empty = json.dumps(plain_document(_File(document.date, document.versions, [])), indent=1)
     return empty.replace('"kernels": []', f'"kernels": [\n{lines}\n ]') + "\n"

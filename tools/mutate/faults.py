@@ -201,8 +201,8 @@ FAULTS = (
     Fault(
         "RoPE's sign in the Triton kernel",
         "turbopi.kernels",
-        "lower, upper = first * c - second * s, second * c + first * s",
-        "lower, upper = first * c + second * s, second * c - first * s",
+        "return first * c - second * s, second * c + first * s",
+        "return first * c + second * s, second * c - first * s",
         "positions count backwards where operations denoise, and in every prefix",
         ("tests/test_kernels_ops.py::test_rope_split",),
     ),

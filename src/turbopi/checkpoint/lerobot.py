@@ -33,6 +33,7 @@ from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import (
     LIMITS,
     MOST_REMEMBERED,
+    WITH_MEMORY,
     Kind,
     MemoryConfig,
     ModelConfig,
@@ -249,7 +250,7 @@ class LeRobotFolder:
         every = self.config.integer("memory_temporal_attention_every", 1, LIMITS["temporal_every"], default=4)
         if not visual and not proprioceptive:
             return None
-        if self.kind != "pi05":
+        if self.kind not in WITH_MEMORY:
             key = f"use_{'visual' if visual else 'proprioceptive'}_memory"
             raise CheckpointError(
                 f"{self.file} has {key} = True and type {self.kind!r}; LeRobot has memory in pi05 alone"

@@ -132,7 +132,7 @@ def serve(
             "--record",
             rich_help_panel=_RECORDING,
             metavar="DIR",
-            help="Write every observation and its actions below DIR.",
+            help="Write observations and actions below DIR.",
         ),
     ] = None,
     record_limit: Annotated[

@@ -22,6 +22,7 @@ from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable import batch_steps
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.portable.attention_tiles import PACKED_ROWS, AttentionTile, chosen_tile
+from turbopi.kernels.portable.rope import rotated
 from turbopi.kernels.portable.rounding import as_stored, damaged
 from turbopi.kernels.portable.shared_memory import capability_of
 from turbopi.kernels.tile_table import NO_TILES, TileTable
@@ -133,7 +134,8 @@ def _turned(at, cos, sin, turn, there, HALF: tl.constexpr):
     second = tl.load(at + HALF, there, 0.0).to(tl.float32)
     c, s = tl.load(cos + turn, there, 0.0), tl.load(sin + turn, there, 0.0)
     dtype = at.dtype.element_ty
-    return (first * c - second * s).to(dtype), (second * c + first * s).to(dtype)
+    lower, upper = rotated(first, second, c, s)
+    return lower.to(dtype), upper.to(dtype)
 
 
 @triton.jit

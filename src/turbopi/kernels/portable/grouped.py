@@ -8,6 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.portable.rope import rotated
 
 LOG2_E = 1.4426950408889634
 ROWS, KEYS = 32, 64  # of a program of attention: prompts are short, so there are many programs rather than large tiles
@@ -30,7 +31,7 @@ def _rope_kernel(
     at = token * (heads + 2 * kv_heads) * 2 * HALF + head * 2 * HALF + pair
     first = tl.load(qkv + at, used, 0.0).to(tl.float32)
     second = tl.load(qkv + at + HALF, used, 0.0).to(tl.float32)
-    lower, upper = first * c - second * s, second * c + first * s
+    lower, upper = rotated(first, second, c, s)
     dtype = k_out.dtype.element_ty
     group = heads // kv_heads
     is_query, is_key = used & (head < heads), used & turned & (head >= heads)

@@ -8,6 +8,12 @@ from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents
 
 
 @triton.jit
+def rotated(first, second, c, s):
+    """Both halves of heads after RoPE by an angle's cosine and sine, in float32."""
+    return first * c - second * s, second * c + first * s
+
+
+@triton.jit
 def _rope_kernel(
     qkv, cos, sin, q_out, k_out, v_out, heads,
     HALF: tl.constexpr, BLOCK_HALF: tl.constexpr, BLOCK_HEADS: tl.constexpr, PDL: tl.constexpr,
@@ -24,7 +30,7 @@ def _rope_kernel(
     at = head * 2 * HALF + pair
     first = tl.load(row + at, used, 0.0).to(tl.float32)
     second = tl.load(row + at + HALF, used, 0.0).to(tl.float32)
-    lower, upper = first * c - second * s, second * c + first * s
+    lower, upper = rotated(first, second, c, s)
     dtype = k_out.dtype.element_ty
     is_query, is_key = used & (head < heads), used & (head == heads)
     q_row = q_out + token * heads * 2 * HALF + at

@@ -11,14 +11,14 @@
 // embed: embed; arrive
 //   guards   x_t, which the end of the step before waits for; the stream and its squares, which gate|up has read; hidden,
 //            which down has read
-// mix: product.run; arrive (where the time is mixed into the tokens)
-//   guards   hidden
+// mix: product.run; arrive
+//   guards   hidden. Where the time is mixed into the tokens
 // qkv: product.run; arrive
 //   guards   stream and squares, of embed or down
 // attention: attend; arrive
 //   guards   queries, keys, values
-// combine: wait; combine; arrive (where a row has several shares of the keys)
-//   guards   partial, tops
+// combine: wait; combine; arrive
+//   guards   partial, tops. Where a row has several shares of the keys
 // out: product.run; arrive
 //   guards   attended; the stream, which q|k|v has read
 // gate_up: product.run; arrive
