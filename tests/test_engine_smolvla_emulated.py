@@ -51,6 +51,8 @@ def run(
     folder: Path,
     blocks: int,
     choice: denoise.Choices | None = None,
+    *,
+    before: Tensor | None = None,
 ) -> Tensor:
     def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
         return Emulated(sizes, folder, 0, prepare=False), Emulated(sizes, folder, 0, prepare=True)
@@ -69,7 +71,8 @@ def run(
     )
     x_t = torch.full((steps + 1, *noise.shape), torch.nan)
     v_t = torch.full((steps, *noise.shape), torch.nan)
-    kernel.launch(noise, keys, values, kept.lengths, x_t, v_t)
+    for one in (noise,) if before is None else (before, noise):
+        kernel.launch(one, keys, values, kept.lengths, x_t, v_t)
     return x_t[-1]
 
 
@@ -97,3 +100,13 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
         relative(one.numpy(), exact.numpy()) for one in (ours, ordinary.denoise(kept, noise[None], steps)[0])
     )
     assert 0 < error <= 1.1 * usual, (error, usual)
+
+
+def test_a_call_that_was_not_finite_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made = model(1, self_every=2, expert_depth=2)
+    kept, noise = cache(made, 14, 5), torch.randn(3, 16, generator=torch.Generator().manual_seed(3))
+    usual, after = (
+        run(made, kept, noise, 1, monkeypatch, tmp_path, 1, before=one)
+        for one in (None, torch.full((3, 16), torch.nan))
+    )
+    assert torch.equal(usual, after)

@@ -80,11 +80,14 @@ def test_golden_cases_hold_on_the_gpu(name: str, precision: FloatPrecision, case
 
 
 @pytest.mark.parametrize(("name", "precision"), MODES)
-def test_repetition_is_bit_identical(name: str, precision: FloatPrecision) -> None:
+def test_repetition_is_bit_identical_even_behind_a_call_that_was_not_finite(
+    name: str, precision: FloatPrecision
+) -> None:
     case = golden_cases()["b_third_masked"]
     runner = backend(name, "pi05", precision)
     first = runner.sample(case.observation, case.noise, 10).actions
-    for _ in range(5):
+    for other in (case.noise, torch.full_like(case.noise, torch.nan), *[case.noise] * 3):
+        runner.sample(case.observation, other, 10)
         assert torch.equal(runner.sample(case.observation, case.noise, 10).actions, first)
 
 

@@ -294,6 +294,8 @@ class CapturedBackend(PyTorchBackend):
             mark("prefix")
 
         second = Graph(prefix, self._pool, self._stream)
+        seen.graph.launch()
+        second.launch()  # what is captured behind it runs once, and shall find a prefix
         return Graphs(inputs, seen.resizer, seen.graph, second, *left[0])
 
     def _seen(self, inputs: Observation) -> Seen:

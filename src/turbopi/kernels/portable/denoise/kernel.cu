@@ -71,6 +71,11 @@ __device__ __forceinline__ void embed(const Args& args, const Stream& into, cons
     else if (i.valid)
       store_operand(args.hidden, i.token, i.tile * 8 + i.pair * 2, silu(v.x), silu(v.y));
   }
+  // The last chunk's columns behind D hold what down has read. Their weights are zeros, but zero times NaN isn't
+  constexpr int BEHIND = (CHUNK - D % CHUNK) % CHUNK / 2;
+  if (!MODULATED && BEHIND)
+    for (int at = blockIdx.x * THREADS + threadIdx.x; at < T * BEHIND; at += BLOCKS * THREADS)
+      store_operand(args.hidden, at / larger(BEHIND, 1), D + at % larger(BEHIND, 1) * 2, 0, 0);
 }
 
 // Final norm, action_out_proj and the Euler step: a warp takes one number of a token.
