@@ -3,6 +3,7 @@
 import inspect
 import io
 import json
+import logging
 import re
 import subprocess
 import sys
@@ -17,11 +18,12 @@ import typer
 from checkpoint_helpers import GOLDEN
 from cli_helpers import check_help, refusal, text_of, turbopi
 from rich.console import Console
+from rich.progress import Progress
 from typer.testing import CliRunner
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
-from turbopi.cli.framework import Output, plain, with_errors_reported
+from turbopi.cli.framework import Output, log_to_stderr, plain, with_errors_reported
 from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import OF_POLICIES, OF_SERVERS, as_typed
 from turbopi.policy.policy import UnifiedPolicy
@@ -114,6 +116,22 @@ def test_messages_wrap_between_words_on_a_terminal_alone(terminal: bool) -> None
     lines = output.console.file.getvalue().splitlines()  # type: ignore[attr-defined]
     assert len(lines) == (4 if terminal else 1)
     assert " ".join(" ".join(lines).split()) == text.strip()
+
+
+def test_a_log_line_stands_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    log_to_stderr()
+    with Progress(console=Console(file=terminal, force_terminal=True, width=60)) as bar:
+        bar.add_task("moments", total=2)
+        logging.getLogger("turbopi").warning("something is odd")
+        bar.refresh()
+    assert any(
+        line.strip() == "warning: something is odd"
+        for line in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()).splitlines()
+    )
 
 
 @pytest.mark.parametrize("command", app.registered_commands, ids=lambda command: str(command.name))

@@ -17,6 +17,7 @@ from typer.testing import Result
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 from turbopi.recordings import RecordedCall, save_call
+from turbopi.support.action_groups import prompt_of
 
 pytestmark = pytest.mark.usefixtures("two_layers")
 
@@ -326,3 +327,17 @@ def test_actions_out_of_range_are_refused_if_so_requested(tmp_path: Path, monkey
     assert "They were clipped" in shown
     message = refusal(turbopi("infer", *options, "--json", "--out-of-range", "clamp"), whole=False)
     assert "unknown --out-of-range clamp; choose one of warn, refuse, clip" in message
+
+
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        ({"prompt": "fold", "label": "x"}, "fold"),
+        ({"task": "fold", "label": "x"}, "fold"),
+        ({"instruction": "fold", "turbopi/session": "arm 1", "state": np.zeros(2)}, "fold"),
+        ({"instruction": "fold", "label": "x"}, ""),
+        ({"state": np.zeros(2)}, ""),
+    ],
+)
+def test_the_task_is_shown_whatever_its_key(observation: dict[str, Any], expected: str) -> None:
+    assert prompt_of(observation) == expected

@@ -136,6 +136,7 @@ def reading(*values: float, stats: FeatureStats | None = None, **more: Any) -> R
 
 def test_a_value_somewhat_outside_is_named_once_it_stays_there() -> None:
     watch = Watch()
+    assert watch.notes(reading(5.0, 5.0)) == []
     for _ in range(SUSTAINED - 1):
         assert watch.notes(reading(13.0, 5.0)) == []
     (note,) = watch.notes(reading(13.0, 5.0))
@@ -157,7 +158,19 @@ def test_one_that_was_far_stays_named_until_it_is_back_in_range_and_the_log_says
     assert watch.to_log(watch.notes(reading(31.0))) != []
     assert watch.to_log(watch.notes(reading(31.0))) == []
     watch.reset()
-    assert watch.notes(reading(29.0)) == []
+    assert watch.notes(reading(5.0)) == watch.notes(reading(29.0)) == []
+
+
+def test_a_value_somewhat_outside_is_named_at_once_before_the_robot_moves() -> None:
+    watch = Watch()
+    for _ in range(2):  # as long as it stays there
+        (note,) = watch.notes(reading(13.0, 5.0))
+        assert note.names == ("joint 0",) and note.text.startswith("the state is outside the checkpoint's")
+    assert watch.notes(reading(5.0, 5.0)) == watch.notes(reading(13.0, 5.0)) == []
+    watch.reset()  # a new episode
+    assert watch.notes(reading(13.0, 5.0)) != []
+    several, one_by_one = Watch(remembers=False), Watch(remembers=False, at_once=True)  # `infer`'s rows, and its files
+    assert several.notes(reading(13.0)) == [] and all(one_by_one.notes(reading(13.0)) for _ in range(2))
 
 
 def test_a_second_joint_is_logged_at_once() -> None:

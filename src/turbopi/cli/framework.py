@@ -25,6 +25,7 @@ import rich
 import typer
 from msgspec import Struct
 from rich.console import Console
+from rich.file_proxy import FileProxy
 from rich.markup import escape
 from rich.table import Table
 
@@ -296,7 +297,7 @@ class _StderrHandler(logging.Handler):
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         with contextlib.suppress(OSError, ValueError):  # whoever read the log has left: no reason to stop working
             text = f"{time}{level}{as_typed(record.getMessage())}"
-            if sys.stderr.isatty() and not self.stamped:
+            if sys.stderr.isatty() and not self.stamped and not isinstance(sys.stderr, FileProxy):  # a bar's: above it
                 new_console(stderr=True).print(escape(text), highlight=False)
             else:
                 print(text, file=sys.stderr, flush=True)

@@ -246,7 +246,7 @@ class _Notes:
     def __init__(self, output: Output) -> None:
         from turbopi.policy.watch import Watch
 
-        self.output, self._watch = output, Watch(remembers=False)
+        self.output, self._watch = output, Watch(remembers=False, at_once=True)
 
     def of(self, source: Path, reading: "Reading | None") -> list[dict[str, Any]]:
         """The notes of a call, as --json has them. Printed is each once, of the same joints or cameras."""
@@ -320,13 +320,13 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
 
 
 def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: "tuple[DrawnRange, DrawnRange]") -> None:
-    from turbopi.support.action_groups import images_of
+    from turbopi.support.action_groups import images_of, prompt_of
     from turbopi.support.plots import Row, plot_chunks
 
     about = policy.metadata
     rows = [
         Row(
-            _prompt(answer.observation, about),
+            f"“{prompt_of(answer.observation) or about['default_prompt'] or ''}”",
             images_of(answer.observation),
             answer.actions,
             state=policy.pipeline.state(answer.observation),
@@ -346,8 +346,3 @@ def _plot(file: Path, policy: "UnifiedPolicy", answers: list[_Answer], ranges: "
         state_range=ranges[0],
         action_range=ranges[1],
     )
-
-
-def _prompt(observation: dict[str, Any], about: dict[str, Any]) -> str:
-    prompt = observation.get("prompt", observation.get("task", about["default_prompt"]))
-    return f"“{prompt}”"

@@ -2,7 +2,8 @@
 
 A note says what is wrong in this call; what is remembered is from the calls since the robot's last reset:
 
-    state_range        a value of the state is far outside the training data, or somewhat outside for SUSTAINED calls
+    state_range        a value of the state is far outside the training data, or somewhat outside in the first call,
+                       before the robot moves, or for SUSTAINED calls
     action_range       so is an action, of the chunk in this answer
     action_clipped     it was clipped
     camera_black       an image is black, or of one colour everywhere
@@ -105,25 +106,30 @@ class Watch:
     """Of one robot. For one thread at a time.
 
     remembers  False: the readings are of several robots, so none is compared with the one before
+    at_once    what is somewhat outside is said of every call
     clock      in seconds
     """
 
-    def __init__(self, *, remembers: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
-        self._remembers, self._clock = remembers, clock
+    def __init__(
+        self, *, remembers: bool = True, at_once: bool = False, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._remembers, self._at_once, self._clock = remembers, at_once, clock
         self._logged: dict[str, tuple[float, set[str]]] = {}  # kind -> when, and of which joints or cameras
         self.reset()
 
     def reset(self) -> None:
         """A new episode: nothing is remembered but what the log has said."""
         self._streaks: dict[str, int] = {}  # values of the state that are outside, for how many calls
-        self._far: set[str] = set()  # of them, those that a note was about
+        self._shown: set[str] = set()  # of them, those that a note was about
+        self._begins = self._remembers
         self._cameras = CameraWatch()
 
     def notes(self, reading: Reading) -> list[Note]:
         """What there is to say of a call."""
-        found = []
+        found, at_once = [], self._begins or self._at_once
+        self._begins = False
         if reading.outside or self._streaks:
-            found += self._of_state(reading)
+            found += self._of_state(reading, at_once)
         if reading.actions:
             found.append(_of_actions(reading))
         return [*found, *self._of_cameras(reading)]
@@ -139,19 +145,21 @@ class Watch:
                 new.append(note)
         return new
 
-    def _of_state(self, reading: Reading) -> list[Note]:
+    def _of_state(self, reading: Reading, at_once: bool) -> list[Note]:
         if self._remembers:
             self._streaks = {one.name: self._streaks.get(one.name, 0) + 1 for one in reading.outside}
         shown = [
             one
             for one in reading.outside
-            if one.far or one.name in self._far or self._streaks.get(one.name, 0) >= SUSTAINED
+            if at_once or one.far or one.name in self._shown or self._streaks.get(one.name, 0) >= SUSTAINED
         ]
-        if self._remembers:  # one that was far stays so until it is back in range
-            self._far = {one.name for one in shown}
+        if self._remembers:  # one that was shown stays so until it is back in range
+            self._shown = {one.name for one in shown}
         if not shown:
             return []
-        how = "far from" if any(one.far for one in shown) else f"outside, for {SUSTAINED} calls and more,"
+        how = "far from" if any(one.far for one in shown) else "outside"
+        if any(self._streaks.get(one.name, 0) >= SUSTAINED for one in shown) and how == "outside":
+            how = f"outside, for {SUSTAINED} calls and more,"
         text = (
             f"the state is {how} the checkpoint's training range: {listed_values(shown)}. Are its units and the order "
             "of its joints those of the training data?"

@@ -89,3 +89,13 @@ def images_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.n
             if camera_image.shape[-1] == 3:
                 found[name] = camera_image if camera_image.dtype == np.uint8 else np.clip(camera_image, 0, 1)
     return found
+
+
+def prompt_of(observation: Mapping[str, Any]) -> str:
+    """What an observation of any robot says that the task is: its `prompt`, `task` or only text; "" without one."""
+    texts = {key: value for key, value in observation.items() if isinstance(value, str)}
+    for key in ("prompt", "task"):
+        if key in texts:
+            return texts[key]
+    own = [text for key, text in texts.items() if not key.startswith("turbopi/")]
+    return own[0] if len(own) == 1 else ""

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from turbopi.recordings import load_call, recorded_files
-from turbopi.support.action_groups import images_of
+from turbopi.support.action_groups import images_of, prompt_of
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading import is_finite, read_json
 from turbopi.view.calls import EncodedImage, ViewedCall, ViewedTrouble
@@ -52,7 +52,7 @@ def recorded(recording: Path) -> Iterator[ViewedCall | ViewedTrouble]:
             robot="",
             number=number,
             time=call.time,
-            prompt=_prompt(call.observation),
+            prompt=prompt_of(call.observation),
             actions=_actions(call.result),
             camera_images={
                 name: as_png(camera_image)
@@ -80,11 +80,6 @@ def numbers_of(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
         for key, value in observation.items()
         if isinstance(value, np.ndarray) and value.ndim == 1 and value.size and value.dtype.kind in "fiu"
     }
-
-
-def _prompt(observation: Mapping[str, Any]) -> str:
-    prompt = observation.get("prompt", observation.get("task", ""))
-    return prompt if isinstance(prompt, str) else ""
 
 
 def _actions(result: Mapping[str, Any]) -> np.ndarray | None:

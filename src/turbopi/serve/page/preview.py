@@ -8,7 +8,7 @@ from PIL import Image
 
 from turbopi.realtime.wire import unpack
 from turbopi.serve.page.messages import Preview, Thumbnail, clean
-from turbopi.support.action_groups import images_of
+from turbopi.support.action_groups import images_of, prompt_of
 
 THUMBNAIL = 224  # pixels of the longer side
 IMAGES = 4
@@ -29,11 +29,10 @@ def make_preview(
     Without the message, which is too long to store, there is less to show.
     """
     observation = {} if message is None else unpack(message)
-    prompt = observation.get("prompt", observation.get("task", ""))
     return Preview(
         number=number,
         time=time,
-        prompt=clean(prompt if isinstance(prompt, str) else ""),
+        prompt=clean(prompt_of(observation)),
         actions=_chunk(reply.get("actions")),
         state=list(state[:NUMBERS]),
         numbers=_numbers(observation),
