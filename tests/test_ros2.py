@@ -1,6 +1,7 @@
 """examples/ros2 against a stand-in of rclpy: its messages reach the policy as it expects, and trajectories come out."""
 
 import importlib.util
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -131,7 +132,7 @@ def test_a_robot_gets_a_trajectory_and_the_policy_rgb_and_joints_in_its_order(
         robot = Robot(example, monkeypatch, server.port, max_jump=0.0)
         node = robot.node
         node.control_step()
-        assert node.logged[0].startswith("nothing has come yet from /front/image_raw, /wrist/image_raw, joint_1")
+        assert node.logged[0] == "nothing has come yet from /front/image_raw, /wrist/image_raw, /joint_states"
         robot.see()
         robot.run_until(lambda: len(node.published) >= 3)
         node.chunks.close()
@@ -174,7 +175,53 @@ def test_old_images_move_nothing(example: ModuleType, monkeypatch: pytest.Monkey
             robot.node.control_step()
         robot.node.chunks.close()
     assert not robot.node.published and not policy.seen
-    assert robot.node.chunks.report()["observations"]["stale"] > 0
+    (said,) = (line for line in robot.node.logged if "older" in line)
+    assert re.fullmatch(
+        r"what came last from /(front|wrist)/image_raw is older than max_age, 30 s: nothing goes out", said
+    )
+
+
+def test_one_joint_that_no_longer_comes_is_named_and_moves_nothing(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(Policy()) as server:
+        robot = Robot(example, monkeypatch, server.port, max_age=0.2)
+        robot.see()
+        time.sleep(0.3)
+        for topic in ("/front/image_raw", "/wrist/image_raw"):
+            robot.send(topic, image(example, "rgb8", RED))
+        robot.send("/joint_states", example.JointState(["gripper", *JOINTS[:-1]], [0.5, *range(1, 7)]))
+        robot.node.control_step()
+        robot.node.chunks.close()
+    assert not robot.node.published
+    assert "what came last from joint_7 is older than max_age, 0.2 s: nothing goes out" in robot.node.logged
+
+
+@pytest.mark.parametrize("where", ["state", "action_joints"])
+def test_a_misspelt_joint_is_named_and_moves_nothing(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    right = parameters()[where]
+    wrong = [one.replace("joint_2", "jiont_2") for one in right]
+    policy = Policy()
+    with running(policy) as server:
+        robot = Robot(example, monkeypatch, server.port, **{where: wrong})
+        robot.see()
+        for _ in range(5):
+            robot.node.control_step()
+        robot.node.chunks.close()
+    assert not robot.node.published and not policy.seen
+    (said,) = (line for line in robot.node.logged if "jiont_2" in line)
+    assert said.startswith("/joint_states has no jiont_2; it has gripper, joint_7") and "action_joints" in said
+
+
+@pytest.mark.parametrize("name", ["control_hz", "max_age"])
+def test_a_rate_or_an_age_of_nothing_is_refused_by_name_and_whole_numbers_do(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    with pytest.raises(ValueError, match=rf"the parameter {name} is 0\.0; expected a number above 0"):
+        Robot(example, monkeypatch, 1, **{name: 0})
+    assert Robot(example, monkeypatch, 1, control_hz=20, max_age=1, max_jump=0).node.step == 0.05
 
 
 def test_an_image_of_another_kind_is_named_once(example: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Duration
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -54,24 +55,24 @@ class PolicyNode(Node):  # type: ignore[misc]
         self.prompt = str(self._parameter("prompt", "fold the towel"))
         self.state = pairs(self._parameter("state", ["observation/state=joint_1"]))
         self.action_joints = list(self._parameter("action_joints", ["joint_1"]))
-        self.max_age = float(self._parameter("max_age", 1.0))
-        self.step = 1 / float(self._parameter("control_hz", 30.0))
+        self.max_age = self._positive("max_age", 1.0)
+        self.step = 1 / self._positive("control_hz", 30.0)
         self.server = str(self._parameter("server", "ws://localhost:8000"))
         self.execution: Any = self._parameter("execution", "async")
         jump = float(self._parameter("max_jump", 0.0))
         self.max_jump = jump or None
         self.cameras = {key: names[0] for key, names in pairs(self._parameter("cameras", ["image=/image_raw"])).items()}
         self.images: dict[str, tuple[Image, float]] = {}  # key -> the newest, and when it was taken
-        self.positions: dict[str, float] = {}
-        self.positions_at = 0.0
+        self.positions: dict[str, tuple[float, float]] = {}  # joint -> its position, and when it was measured
         self.chunks: RealTimeExecutor | None = None
         self.kind = self.complaint = ""
+        self.error: BaseException | None = None  # of the policy, which is over
         for key, topic in self.cameras.items():
             self.create_subscription(
                 Image, topic, lambda image, key=key: self._take_image(key, image), qos_profile_sensor_data
             )
-        joint_states = str(self._parameter("joint_states", "/joint_states"))
-        self.create_subscription(JointState, joint_states, self._take_joints, qos_profile_sensor_data)
+        self.joint_states = str(self._parameter("joint_states", "/joint_states"))
+        self.create_subscription(JointState, self.joint_states, self._take_joints, qos_profile_sensor_data)
         self.trajectory = self.create_publisher(
             JointTrajectory, str(self._parameter("trajectory", "/arm_controller/joint_trajectory")), 1
         )
@@ -79,7 +80,14 @@ class PolicyNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self.connect)
 
     def _parameter(self, name: str, default: Any) -> Any:
-        return self.declare_parameter(name, default).value
+        """Of any type: 20 is a rate as 20.0 is."""
+        return self.declare_parameter(name, default, ParameterDescriptor(dynamic_typing=True)).value
+
+    def _positive(self, name: str, default: float) -> float:
+        value = float(self._parameter(name, default))
+        if not 0 < value < float("inf"):
+            raise ValueError(f"the parameter {name} is {value}; expected a number above 0")
+        return value
 
     def connect(self) -> None:
         """Until the server is there for the first time; afterwards the client connects again by itself."""
@@ -100,8 +108,8 @@ class PolicyNode(Node):  # type: ignore[misc]
         self.images[key] = image, self._taken_at(image.header.stamp)
 
     def _take_joints(self, joints: JointState) -> None:
-        self.positions.update(zip(joints.name, joints.position, strict=False))
-        self.positions_at = self._taken_at(joints.header.stamp)
+        taken = self._taken_at(joints.header.stamp)
+        self.positions.update((name, (at, taken)) for name, at in zip(joints.name, joints.position, strict=False))
 
     def _taken_at(self, stamp: Any) -> float:
         """A message's moment on the executor's clock; of one without a stamp: now."""
@@ -109,14 +117,28 @@ class PolicyNode(Node):  # type: ignore[misc]
         age = 1e-9 * (self.get_clock().now().nanoseconds - taken) if taken else 0.0
         return time.monotonic() - max(0.0, age)
 
-    def observation(self) -> dict[str, Any] | None:
-        """The newest images and joints under the policy's keys; None until all have come, and for a wrong image."""
+    def observation(self) -> tuple[dict[str, Any], float] | None:
+        """The newest images and joints under the policy's keys, and when the oldest was taken.
+
+        None until all have come, for a wrong image, and while one is too old.
+        """
         missing = [self.cameras[key] for key in self.cameras if key not in self.images]
-        missing += [name for names in self.state.values() for name in names if name not in self.positions]
+        missing += [] if self.positions else [self.joint_states]
         if missing:
             self._complain(f"nothing has come yet from {', '.join(missing)}")
             return None
-        state = {key: np.array([self.positions[name] for name in names]) for key, names in self.state.items()}
+        needed = [name for names in self.state.values() for name in names]
+        if unknown := [name for name in (*needed, *self.action_joints) if name not in self.positions]:
+            named, there = ", ".join(dict.fromkeys(unknown)), ", ".join(self.positions)
+            self._complain(f"{self.joint_states} has no {named}; it has {there}. Look at state and action_joints")
+            return None
+        taken = {self.cameras[key]: at for key, (_, at) in self.images.items()}
+        taken |= {name: self.positions[name][1] for name in needed}
+        source, oldest = min(taken.items(), key=lambda one: one[1])
+        if time.monotonic() - oldest > self.max_age:
+            self._complain(f"what came last from {source} is older than max_age, {self.max_age:g} s: nothing goes out")
+            return None
+        state = {key: np.array([self.positions[name][0] for name in names]) for key, names in self.state.items()}
         pixels = {}
         for key, (image, _) in self.images.items():
             try:
@@ -124,7 +146,7 @@ class PolicyNode(Node):  # type: ignore[misc]
             except ValueError as error:
                 self._complain(f"the image of {self.cameras[key]}: {error}")
                 return None
-        return {**pixels, **state, "prompt": self.prompt}
+        return {**pixels, **state, "prompt": self.prompt}, oldest
 
     def control_step(self) -> None:
         """One command: a point of a trajectory, or nothing."""
@@ -132,8 +154,8 @@ class PolicyNode(Node):  # type: ignore[misc]
         if executor is None:
             return
         try:
-            if executor.wants_observation and (observation := self.observation()) is not None:
-                executor.observe(observation, min([self.positions_at, *(taken for _, taken in self.images.values())]))
+            if executor.wants_observation and (seen := self.observation()) is not None:
+                executor.observe(*seen)
             command = executor.next_action()
         except TurboPiError as error:  # this policy can't be run in this way
             self._complain(str(error))
@@ -141,9 +163,9 @@ class PolicyNode(Node):  # type: ignore[misc]
         if command.kind != self.kind:
             self.kind = command.kind
             if self.kind == "fresh":
-                self.complaint = ""  # the same one later is news
+                self.complaint, self.error = "", executor.last_error  # the same complaint later is news, not the error
             self.get_logger().info(f"commands are {command.kind}")
-        if command.kind != "fresh" and executor.last_error is not None:
+        if command.kind != "fresh" and executor.last_error is not self.error:
             self._complain(str(executor.last_error))
         if command.action is not None:
             if len(command.action) != len(self.action_joints):

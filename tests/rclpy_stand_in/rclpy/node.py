@@ -5,6 +5,8 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+from rcl_interfaces.msg import ParameterDescriptor
+
 import rclpy
 
 
@@ -14,9 +16,10 @@ class Node:
         self.published: list[Any] = []
         self.logged: list[str] = []
 
-    def declare_parameter(self, name: str, default: Any) -> Any:
+    def declare_parameter(self, name: str, default: Any, descriptor: ParameterDescriptor) -> Any:
         value = rclpy.PARAMETERS.get(name, default)
-        assert type(value) is type(default), f"{name}: rclpy refuses a value of another type"
+        same = type(value) is type(default)
+        assert same or descriptor.dynamic_typing, f"{name}: rclpy refuses a value of another type"
         return SimpleNamespace(value=value)
 
     def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
