@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from realtime_fakes import HZ, Clock, LinePolicy, Loop, started
 
 from turbopi.realtime import WAYS, OutOfActions, RealTimeExecutor
+from turbopi.realtime.messages import NOTES
 from turbopi.support.errors import ConfigError, ObservationError
 
 RTC = [name for name, way in WAYS.items() if way.mode is not None]
@@ -406,6 +407,31 @@ def test_a_jump_beyond_the_limit_is_refused_and_counted() -> None:
     policy.change = lambda result: {"actions": result["actions"] + 5}
     loop.run(12, delay=0)
     assert loop.executor.report()["dropped"]["jump"] >= 1 and kinds(loop)[-1] == "h"
+
+
+def test_a_chunk_with_a_note_that_holds_is_dropped_and_others_are_not() -> None:
+    loop, policy = started("sync", hold_on=["camera_black"])
+    notes = [{"kind": "camera_size", "names": ["front"], "text": "it has another size"}]
+    policy.change = lambda result: result | {NOTES: notes}
+    loop.run(6, delay=0)
+    assert loop.executor.report()["dropped"] == {} and kinds(loop)[-1] == "f"
+    notes.append({"kind": "camera_black", "names": ["front"], "text": "camera front is black"})
+    loop.run(24, delay=0)
+    assert kinds(loop)[-1] == "h"
+    report = loop.executor.report()
+    assert report["dropped"]["noted"] >= 1 and {one["kind"] for one in report["notes"]} == {
+        "camera_size",
+        "camera_black",
+    }
+    notes.pop()
+    loop.run(12, delay=0)
+    assert kinds(loop)[-1] == "f"
+
+
+@pytest.mark.parametrize("wrong", ["camera_black", ["camera_blak"], 3])
+def test_kinds_of_notes_that_are_none_are_refused(wrong: Any) -> None:
+    with pytest.raises(ConfigError, match=r"hold_on has .*; it should be a list of some of state_range, "):
+        started("async", hold_on=wrong)
 
 
 # --- time -------------------------------------------------------------------------------------------------------------

@@ -31,10 +31,6 @@ from turbopi.realtime.messages import NOTES, Note
 
 logger = logging.getLogger(__name__)
 
-KINDS = (
-    *("state_range", "action_range", "action_clipped"),
-    *("camera_black", "camera_frozen", "camera_size", "camera_exchanged", "camera_channels"),
-)
 READING = "reading"  # of a result, for a server, which knows the robots apart
 NEAR, FAR = 0.25, 2.0  # margins, in widths of the training range on either side of it: beyond the latter is far
 SUSTAINED = 20  # calls

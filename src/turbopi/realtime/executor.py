@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
@@ -17,11 +17,11 @@ from turbopi.config import Schedule
 from turbopi.realtime import ChunkQueue, DelayEstimate, Execution, Seam, way_named
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.realtime.journal import Command, Inferred, Journal, Kind, OutOfActions
-from turbopi.realtime.messages import PREFIX
+from turbopi.realtime.messages import PREFIX, notes_in
 from turbopi.realtime.policies import check_policy, server_joins
 from turbopi.realtime.queue import OLD_WEIGHT, summary
 from turbopi.realtime.running_chunk import RunningChunk
-from turbopi.realtime.settings import above_zero, checked_hold_action, held_values
+from turbopi.realtime.settings import above_zero, checked_hold_action, checked_note_kinds, held_values
 from turbopi.realtime.warm_up import expected_delay, warm_policy
 from turbopi.support.errors import ConfigError
 
@@ -55,6 +55,7 @@ class RealTimeExecutor:
     max_pause_s        a longer time between two calls of `next_action`, or a clock that goes back, is a jump of the
                        clock: all actions belong to the past and are dropped. None: 0.5 s, or 10 steps if that is more
     max_jump           the most that a command may move in one step, in the robot's units (`ChunkQueue`)
+    hold_on            kinds of notes (docs/safety.md), such as ["camera_black"]: a chunk with one is dropped
     delay_percentile, delay_window
                        the delay to expect is this percentile of so many last ones
     infer_arguments    what else `policy.infer` is given in every call, such as {"num_steps": 5}
@@ -79,6 +80,7 @@ class RealTimeExecutor:
         max_observation_age_s: float = 1.0,
         max_pause_s: float | None = None,
         max_jump: float | np.ndarray | None = None,
+        hold_on: Collection[str] = (),
         delay_percentile: float = 95.0,
         delay_window: int = 50,
         infer_arguments: Mapping[str, Any] | None = None,
@@ -96,6 +98,7 @@ class RealTimeExecutor:
         self._max_age = above_zero("max_observation_age_s", max_observation_age_s)
         pause = max(0.5, 10 / self._hz) if max_pause_s is None else max_pause_s
         self._max_pause = above_zero("max_pause_s", pause)
+        self._hold_on = checked_note_kinds(hold_on)
         self._way = way_named(execution)
         self._policy = policy
         self._offered = check_policy(policy, self._way)
@@ -396,6 +399,9 @@ class RealTimeExecutor:
             if now - taken_at > self._max_age:
                 self._queue.fail("stale", f"its observation is {now - taken_at:.3f} s old")
                 entry.outcome = "stale"
+            elif noted := [note for note in notes_in(result) if note.kind in self._hold_on]:
+                self._queue.fail("noted", noted[0].text)
+                entry.outcome = "noted"
             else:
                 entry.outcome = self._queue.arrive(result) or "used"
         self._anew = self._anew or entry.outcome != "used"  # the server takes every chunk for carried out

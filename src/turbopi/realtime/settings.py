@@ -1,10 +1,12 @@
 """The executor's settings, checked."""
 
 import math
-from typing import Literal
+from collections.abc import Collection
+from typing import Any, Literal
 
 import numpy as np
 
+from turbopi.realtime.messages import NOTE_KINDS
 from turbopi.support.errors import ConfigError
 
 Hold = Literal["last"] | np.ndarray | None
@@ -17,6 +19,16 @@ def above_zero(name: str, value: float, most: float = math.inf) -> float:
         limit = "" if most == math.inf else f", at most {most:g}"
         raise ConfigError(f"{name} is {value!r}; it should be a number above 0{limit}")
     return float(value)
+
+
+def checked_note_kinds(given: object) -> frozenset[str]:
+    """Kinds of notes. Raises ConfigError for anything else."""
+    several = isinstance(given, Collection) and not isinstance(given, str | bytes)
+    kinds: list[Any] = list(given) if isinstance(given, Collection) and several else [given]
+    wrong = [kind for kind in kinds if not several or kind not in NOTE_KINDS]
+    if wrong:
+        raise ConfigError(f"hold_on has {wrong[0]!r}; it should be a list of some of {', '.join(NOTE_KINDS)}")
+    return frozenset(kinds)
 
 
 def checked_hold_action(given: object, on_empty: str) -> Hold:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from turbopi.policy.watch import KINDS as NOTE_KINDS
+from turbopi.realtime.messages import NOTE_KINDS
 from turbopi.serve.scheduling.schedule import PRIORITIES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
