@@ -153,9 +153,12 @@ class Watch:
             self._shown = {one.name for one in shown}
         if not shown:
             return []
-        how = "far from" if any(one.far for one in shown) else "outside"
-        if any(self._streaks.get(one.name, 0) >= SUSTAINED for one in shown) and how == "outside":
+        if any(one.far for one in shown):
+            how = "far from"
+        elif any(self._streaks.get(one.name, 0) >= SUSTAINED for one in shown):
             how = f"outside, for {SUSTAINED} calls and more,"
+        else:
+            how = "outside"
         text = (
             f"the state is {how} the checkpoint's training range: {listed_values(shown)}. Are its units and the order "
             "of its joints those of the training data?"

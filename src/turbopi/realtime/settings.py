@@ -1,8 +1,7 @@
 """The executor's settings, checked."""
 
 import math
-from collections.abc import Collection
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -23,12 +22,9 @@ def above_zero(name: str, value: float, most: float = math.inf) -> float:
 
 def checked_note_kinds(given: object) -> frozenset[str]:
     """Kinds of notes. Raises ConfigError for anything else."""
-    several = isinstance(given, Collection) and not isinstance(given, str | bytes)
-    kinds: list[Any] = list(given) if isinstance(given, Collection) and several else [given]
-    wrong = [kind for kind in kinds if not several or kind not in NOTE_KINDS]
-    if wrong:
-        raise ConfigError(f"hold_on has {wrong[0]!r}; it should be a list of some of {', '.join(NOTE_KINDS)}")
-    return frozenset(kinds)
+    if not isinstance(given, list | tuple | set | frozenset) or any(kind not in NOTE_KINDS for kind in given):
+        raise ConfigError(f"hold_on has {given!r}; it should be a list of some of {', '.join(NOTE_KINDS)}")
+    return frozenset(given)
 
 
 def checked_hold_action(given: object, on_empty: str) -> Hold:
