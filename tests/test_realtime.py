@@ -371,6 +371,28 @@ def test_a_policy_that_raises_is_asked_again_and_the_running_chunk_goes_on() -> 
     assert report["last_error"] == "ObservationError: the state has 7 numbers, expected 8"
 
 
+def test_the_log_says_that_the_policy_fails_that_the_robot_holds_and_that_both_are_over(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    loop, policy = started("rtc", execution_horizon=4)
+    loop.run(6, delay=0)
+    for _ in range(2):  # the same failure a second time is a new one
+        caplog.clear()
+        policy.error = ConnectionError("no server")
+        loop.run(40, delay=0)  # 0.8 s, of which the running chunk covers less than 0.2
+        policy.error = None
+        loop.run(2, delay=0)
+        assert caplog.messages == [
+            "the policy failed: ConnectionError: no server",
+            "the robot holds: the last chunk was dropped (failed: ConnectionError: no server)",
+            "the policy answers again",
+            caplog.messages[-1],
+        ]
+        after = re.fullmatch(r"the robot moves again, after (0\.\d) s", caplog.messages[-1])
+        assert after is not None and 0.5 < float(after[1]) <= 0.8
+        loop.run(6, delay=0)
+
+
 def test_a_chunk_with_nan_is_refused_and_counted() -> None:
     loop, policy = started("async", execution_horizon=4)
     loop.run(6, delay=0)

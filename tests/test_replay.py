@@ -15,6 +15,7 @@ from replay_data import EVERY, write_npz
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli.replay import parse_numbers
+from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import CHASE_POLICY, SMALL_POLICY
 from turbopi.preprocess.normalize import Normalizer
@@ -26,7 +27,7 @@ from turbopi.replay.judge import judge
 from turbopi.replay.keys import KeyMap
 from turbopi.replay.opening import open_dataset
 from turbopi.replay.page import DOCUMENT, PAGE
-from turbopi.replay.report import Report
+from turbopi.replay.report import CAMERAS, Report
 from turbopi.replay.run import OF_AN_EPISODE, Replay, Replayed, Settings, affordable, select, variations_of
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.reading import read_document
@@ -134,6 +135,7 @@ def judged(
         call_ms=[1.0],
         changed=(),
         variations={},
+        cameras={},
     )
     one = compare.compared("the policy", run)
     document = compare.policy_document(one, "here", ("a", "b", "c", "d"))
@@ -267,6 +269,12 @@ def test_the_command_writes_its_report(tmp_path: Path) -> None:
     assert "default-src 'none'" in page and "pytorch f32, 2 steps beside pytorch f32" in page
     for name in ("by_index", "joints", "episode", "worst"):
         assert f'src="{name}.png"' in page and (report / f"{name}.png").is_file()
+    assert "--known-cameras" not in ran.stdout  # which is JSON
+    known = KnownCameras.load(report / CAMERAS)
+    assert {name: len(images) for name, images in known.images.items()} == {
+        "observation/image": 3,
+        "observation/wrist_image": 3,
+    }
 
 
 @pytest.mark.usefixtures("unseen_plots")
@@ -277,6 +285,7 @@ def test_random_weights_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     tables = [line for line in ran.output.splitlines() if set(line) & set("│┃━")]
     assert len(tables) > 20 and max(map(len, tables)) <= 80 and "…" not in "".join(tables).replace(" … ", "")
     assert ran.exit_code == 1 and "don't follow" in ran.output and "weights are random" in ran.output
+    assert not (tmp_path / "report" / CAMERAS).exists(), "what is wrong isn't kept as known"
 
 
 def refused(*arguments: object) -> str:

@@ -17,10 +17,20 @@ from policy_helpers import policy_on
 from turbopi import UnifiedPolicy, open_checkpoint
 from turbopi.backends import Sample
 from turbopi.checkpoint.norm_stats import FeatureStats
+from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.ranges import TrainingRange
 from turbopi.policy.readings import Checks, sample
 from turbopi.policy.shipped import SMALL_POLICY, load_frames, observations
-from turbopi.policy.watch import COMPARED_EVERY, FROZEN, MOST_CAMERAS, REPEAT_SECONDS, SUSTAINED, Reading, Watch
+from turbopi.policy.watch import (
+    COMPARED_EVERY,
+    FROZEN,
+    MOST_CAMERAS,
+    READING,
+    REPEAT_SECONDS,
+    SUSTAINED,
+    Reading,
+    Watch,
+)
 from turbopi.realtime import RealTimeExecutor
 from turbopi.realtime.client import RealTimeClient
 from turbopi.realtime.messages import NOTES, notes_in
@@ -360,6 +370,75 @@ def test_exchanged_channels_are_named_when_they_are_exchanged_after_the_start(po
         assert kinds(policy.infer(one, seed=0)) == []
     found = [notes_in(policy.infer({**one, BASE: one[BASE][..., ::-1].copy()}, seed=0)) for one in colourful]
     assert [(note.kind, note.names) for note in found[-1]] == [("camera_channels", (BASE,))]
+
+
+@pytest.fixture(scope="module")
+def cameras_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of two tasks: the observations of the third are new to it."""
+    file = tmp_path_factory.mktemp("replay") / "cameras.npz"
+    known = load_frames()[2:]
+    samples = {BASE: [sample(frame.base) for frame in known], WRIST: [sample(frame.wrist) for frame in known]}
+    made = KnownCameras.of_samples(samples)
+    assert made is not None
+    made.save(file)
+    return file
+
+
+def test_known_cameras_show_a_mistake_in_the_first_call(fixed: Fixed, cameras_file: Path) -> None:
+    policy = policy_of(fixed, known_cameras=cameras_file)
+    seen = frames(policy)[0]
+    assert NOTES not in policy.infer(seen, seed=0)
+    policy.reset()
+    exchanged = {**seen, BASE: seen[WRIST], WRIST: seen[BASE]}
+    for _ in range(2):  # as long as they are
+        (note,) = notes_in(policy.infer(exchanged, seed=0))
+        assert (note.kind, note.names) == ("camera_exchanged", (BASE, WRIST)) and str(cameras_file) in note.text
+    policy.reset()
+    (note,) = notes_in(policy.infer({**seen, BASE: seen[BASE][..., ::-1].copy()}, seed=0))
+    assert (note.kind, note.names) == ("camera_channels", (BASE,)) and str(cameras_file) in note.text
+    rows = policy.infer_batch([exchanged, seen], seed=0)
+    assert [kinds(row) for row in rows] == [["camera_exchanged"], []]
+
+
+def test_one_image_later_on_that_looks_mistaken_is_no_note(fixed: Fixed, cameras_file: Path) -> None:
+    policy = policy_of(fixed, known_cameras=cameras_file)
+    seen = frames(policy)[0]
+    exchanged = {**seen, BASE: seen[WRIST], WRIST: seen[BASE]}
+    calls = [*[seen] * COMPARED_EVERY, exchanged, seen, *[exchanged] * COMPARED_EVERY]
+    found = [kinds(policy.infer(one, seed=0)) for one in calls]
+    assert found[-1] == ["camera_exchanged"] and not any(found[: COMPARED_EVERY + 3])
+
+
+def test_a_comparison_is_sent_with_its_notes(fixed: Fixed, cameras_file: Path) -> None:
+    """A fleet's front makes the notes of what a replica saw."""
+    policy = policy_of(fixed, known_cameras=cameras_file)
+    seen = frames(policy)[0]
+    wrong = {**seen, BASE: seen[WRIST], WRIST: seen[BASE]}
+    sent = pickle.dumps(policy.infer(wrong, seed=0, readings=True)[READING])
+    assert len(sent) < 4096
+    assert [note.kind for note in Watch().notes(pickle.loads(sent))] == ["camera_exchanged"]
+
+
+def test_grey_images_and_unknown_cameras_are_compared_with_nothing(cameras_file: Path) -> None:
+    grey = sample(np.arange(32 * 32, dtype=np.int64).reshape(32, 32, 1).repeat(3, 2).astype(np.uint8))
+    assert KnownCameras.load(cameras_file).notes({"another": grey}) == ()
+    known = KnownCameras.of_samples({"a": [grey]})
+    assert known is not None and known.notes({"a": grey}) == ()
+    assert KnownCameras.of_samples({"a": [sample(np.zeros((3, 5, 3), np.uint8))]}) is None
+
+
+def test_a_file_of_something_else_is_refused(fixed: Fixed, tmp_path: Path) -> None:
+    file = tmp_path / "cameras.npz"
+    expected = "expected the cameras.npz that `turbopi replay` writes"
+    with pytest.raises(ConfigError, match=f"cameras.npz can't be read .*{expected}"):
+        policy_of(fixed, known_cameras=file)
+    for content, said in (({}, "has no camera"), ({"top": np.zeros(3)}, r"top is float64\[3\], not uint8\[K, 432\]")):
+        np.savez(file, **content)  # type: ignore[arg-type]  # names are keywords
+        with pytest.raises(ConfigError, match=f"{said}; {expected}"):
+            policy_of(fixed, known_cameras=file)
+    file.write_bytes(b"PK nothing")
+    with pytest.raises(ConfigError, match=expected):
+        policy_of(fixed, known_cameras=file)
 
 
 def test_masked_cameras_and_float_images_are_judged_as_they_are() -> None:

@@ -57,7 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         one.add_argument("--small", action="store_true", help="tiny counts, to try it")
     show = kinds.add_parser("show", help="the table of a result file")
     show.add_argument("file", type=Path)
-    show.add_argument("--markdown", action="store_true", help="the table of docs/dev/attack.md")
     frame = kinds.add_parser("frame", help="one frame, and its answer")
     frame.add_argument("seed", type=int)
     frame.add_argument("number", type=int)
@@ -173,9 +172,6 @@ def _end(out: Path, pieces: list[results.Piece]) -> int:
 
 def _show(given: argparse.Namespace) -> int:
     pieces = results.load(given.file)
-    if given.markdown:
-        print(results.markdown(pieces))
-        return 0
     console = Console()
     console.print(results.table(pieces))
     for row in results.totals(pieces):

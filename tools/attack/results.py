@@ -173,36 +173,6 @@ def table(pieces: Sequence[Piece]) -> Table:
     return found
 
 
-def markdown(pieces: Sequence[Piece]) -> str:
-    """The table of docs/dev/attack.md: every row with the good client's medians and what was counted."""
-    lines = [
-        "| attack | what | count | good client, ms | ratio | RSS, MB more | verdict |",
-        "|---|---|--:|---|--:|--:|---|",
-    ]
-    servers: dict[str, list[dict[str, Any]]] = {}
-    for one in pieces:
-        servers.setdefault(one.attack, []).append(one.server or {})
-    for row in totals(pieces):
-        bars, good = row.bars, [seen["good"] for seen in servers[row.attack] if "good" in seen]
-        medians = [(_number(one["undisturbed_ms"]["p50"]), _number(one["attacked_ms"]["p50"])) for one in good[:1]]
-        about = ATTACKS[row.attack].about if row.attack in ATTACKS else ""
-        cells = [
-            f"`{row.attack}`",
-            about,
-            f"{row.count:,}",
-            "".join(f"{quiet} → {attacked}" for quiet, attacked in medians) if "ratio" in bars else "",
-            _shown(bars.get("ratio")),
-            _shown(bars.get("growth MB")),
-            f"**broken**: {', '.join(row.faults)}" if row.faults else "held",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.1f}"
-
-
 def _shown(bar: JudgedBar | None) -> str:
     if bar is None:
         return "–"

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
@@ -16,9 +16,6 @@ from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps,
 from turbopi.bench.work import JOINS
 from turbopi.support.provenance import Gpu
 from turbopi.support.text import significant
-
-if TYPE_CHECKING:
-    from attack.results import Piece
 
 STAGES = ("vision", "prefix", "denoise")
 
@@ -221,13 +218,6 @@ def machine(document: BenchDocument) -> list[str]:
     ]
 
 
-def attacks(*files: "list[Piece]") -> list[str]:
-    """What the attack tool found."""
-    from attack import results
-
-    return results.markdown([piece for pieces in files for piece in pieces]).splitlines()
-
-
 def image_sizes(document: BenchDocument) -> list[str]:
     """The main job with images as cameras send them: the whole call's median, and how much longer than 224 x 224."""
     main, rows = document.main_job, []
@@ -275,12 +265,6 @@ class Table:
 
 def _read_nothing(file: Path) -> Any:
     raise ValueError(f"the table takes no result file, but {file.name} is named")
-
-
-def _read_attacks(file: Path) -> "list[Piece]":
-    from attack import results
-
-    return results.load(file)
 
 
 def _read_delays(file: Path) -> Any:
@@ -337,7 +321,6 @@ _OF_BENCHMARKS = (
 )
 TABLES = {
     **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
-    "attacks": Table(_read_attacks, attacks),
     "delays": Table(_read_delays, delays),
     "small_policy": Table(_read_judged, small_policy),
     "small_policy_delays": Table(_read_judged, small_policy_delays),

@@ -97,6 +97,7 @@ def infer(
     drawing = None if no_plot else plot or out.with_suffix(".png")
     from turbopi.models import family_of
     from turbopi.policy.call_options import checked_noise
+    from turbopi.policy.known_cameras import KnownCameras
     from turbopi.policy.readings import Checks
     from turbopi.recordings import load_observation
 
@@ -116,7 +117,8 @@ def infer(
         seen = pipeline.see(first, resize=False)
         read_state(seen.robot.state, "state", None)
         judges_ranges = opened.format != "random"
-        checks = Checks(pipeline, opened.norm_stats, options.out_of_range, judges_ranges)  # type: ignore[arg-type]
+        known = None if options.known_cameras is None else KnownCameras.load(options.known_cameras)
+        checks = Checks(pipeline, opened.norm_stats, options.out_of_range, judges_ranges, known)  # type: ignore[arg-type]
     noted, ranges = _Notes(output), checks.drawn
     noted.of(sources[0], checks.reading(seen))
     model = opened.config.model

@@ -331,6 +331,17 @@ class ActingOptions(PolicyOptions):
             "the answer says. These are no limits of your robot: docs/safety.md.",
         ),
     ] = "warn"
+    known_cameras: Annotated[
+        Path | None,
+        _option(
+            "--known-cameras",
+            panel=_RUNNING,
+            metavar="FILE",
+            help="The cameras.npz that `turbopi replay` wrote: cameras that are exchanged, or BGR, are noted from the "
+            "first call on.",
+        ),
+    ] = None
 
     def policy_arguments(self) -> dict[str, Any]:
-        return {**super().policy_arguments(), "out_of_range": self.out_of_range}
+        given = {"out_of_range": self.out_of_range, "known_cameras": self.known_cameras}
+        return {**super().policy_arguments(), **given}

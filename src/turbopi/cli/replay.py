@@ -133,6 +133,7 @@ def replay_command(
     from turbopi.replay.lerobot_dataset import INFO
     from turbopi.replay.opening import open_dataset
     from turbopi.replay.page import DOCUMENT
+    from turbopi.replay.report import CAMERAS
     from turbopi.replay.run import Settings, chosen_episodes
 
     wanted = None if episodes is None else parse_numbers(episodes)
@@ -150,8 +151,13 @@ def replay_command(
     document = _run(options, opened, second, data, selected, every, settings, report, output)
     _show(document, output)
     output.line(f"wrote {report}: replay.html, its plots, {DOCUMENT}")
+    if (report / CAMERAS).is_file():
+        output.line(
+            f"next: turbopi serve … --known-cameras {report / CAMERAS} notes cameras that are exchanged, or BGR, from "
+            "the robot's first call on"
+        )
     output.document(document)
-    if document.verdict.level == "differs" or document.verdict.hints:
+    if not document.verdict.passed:
         raise typer.Exit(CHECK_FAILED)
 
 

@@ -17,6 +17,7 @@ OF_POLICIES = {
     "default_prompt": "--default-prompt",
     "strict": "--strict",
     "out_of_range": "--out-of-range",
+    "known_cameras": "--known-cameras",
 }
 OF_SERVERS = {
     "host": "--host",

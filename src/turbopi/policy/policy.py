@@ -36,6 +36,7 @@ from turbopi.policy.call_options import (
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.history import ObservationHistory
+from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
 from turbopi.policy.watch import PolicyWatch
@@ -77,6 +78,8 @@ class UnifiedPolicy:
         progress: show a bar while the weights load.
         out_of_range: what becomes of actions far outside the training range: "warn", "clip" or "refuse", with an
             ActionError (docs/safety.md).
+        known_cameras: the cameras.npz that `turbopi replay` wrote: cameras that are exchanged, or BGR, are then noted
+            from the first call on.
         strict: refuse calls that `warmup` didn't cover, with an ObservationError, instead of compiling while a robot
             moves.
 
@@ -102,9 +105,11 @@ class UnifiedPolicy:
         progress: bool = False,
         strict: bool = False,
         out_of_range: OutOfRange = "warn",
+        known_cameras: str | Path | None = None,
     ) -> None:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
+        known = None if known_cameras is None else KnownCameras.load(known_cameras)
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
         backends.check(name, self._device, precision)  # before a calibration is looked for, and weights are read
@@ -120,7 +125,11 @@ class UnifiedPolicy:
         reader = reader_of(checkpoint, prompt_tokenizer)
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
         self._checks = Checks(
-            self._pipeline, checkpoint.norm_stats, out_of_range, judges_ranges=checkpoint.format != "random"
+            self._pipeline,
+            checkpoint.norm_stats,
+            out_of_range,
+            judges_ranges=checkpoint.format != "random",
+            known_cameras=known,
         )
         self._watch = PolicyWatch()
         of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes

@@ -11,15 +11,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from turbopi.checkpoint.norm_stats import NormStats
+from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.ranges import DrawnRange, TrainingRange, refusal
-from turbopi.policy.watch import MOST_CAMERAS, Reading, Sample
+from turbopi.policy.watch import GRID, MOST_CAMERAS, Comparison, Reading, Sample
 from turbopi.preprocess.pipeline import Incoming, Pipeline, of_row
 from turbopi.robots.base import Example
 from turbopi.robots.labels import Label, action_labels, camera_label, state_labels
 from turbopi.support.errors import ActionError, ConfigError
 
 OutOfRange = Literal["warn", "refuse", "clip"]
-GRID = 12  # pixels of an image that are looked at, in each direction
 _UINT8 = np.dtype(np.uint8)
 
 
@@ -29,12 +29,18 @@ class Checks:
     out_of_range     what becomes of actions that are far outside: "warn" leaves them, "clip" moves them to the end of
                      what isn't far, "refuse" raises
     judges_ranges    False: the statistics are made up
+    known_cameras    what the images are compared with
 
     Raises ConfigError for another `out_of_range`.
     """
 
     def __init__(
-        self, pipeline: Pipeline, stats: NormStats, out_of_range: OutOfRange = "warn", judges_ranges: bool = True
+        self,
+        pipeline: Pipeline,
+        stats: NormStats,
+        out_of_range: OutOfRange = "warn",
+        judges_ranges: bool = True,
+        known_cameras: KnownCameras | None = None,
     ) -> None:
         if out_of_range not in get_args(OutOfRange):
             raise ConfigError(f"unknown out_of_range={out_of_range!r}; choose one of {', '.join(get_args(OutOfRange))}")
@@ -49,6 +55,7 @@ class Checks:
         self._least, self._most = self._normalized(self.actions.least), self._normalized(self.actions.most)
         self._surely = min([np.inf, *-self._least, *self._most])  # what no action is far beyond, normalised
         self._labels: dict[tuple[str, ...], list[str]] = {}  # of cameras
+        self._known_cameras = known_cameras
 
     @property
     def drawn(self) -> tuple[DrawnRange, DrawnRange]:
@@ -76,7 +83,10 @@ class Checks:
         if isinstance(seen.observation, Example):
             return None
         values: list[float] = np.asarray(seen.robot.state).reshape(-1).tolist()
-        return Reading(values, self.state.widths, self.state.outside(values), images=self._images(seen))
+        images = self._images(seen)
+        cameras = self._known_cameras
+        known = None if cameras is None else Comparison(functools.partial(cameras.notes, images))
+        return Reading(values, self.state.widths, self.state.outside(values), images=images, known=known)
 
     def _images(self, seen: Incoming) -> dict[str, Sample]:
         labels = self._labels.get(seen.cameras)

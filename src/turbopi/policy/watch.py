@@ -9,11 +9,11 @@ A note says what is wrong in this call; what is remembered is from the calls sin
     camera_black       an image is black, or of one colour everywhere
     camera_frozen      it was the same in FROZEN calls, while the robot or another camera's image moved
     camera_size        it has another resolution than before
-    camera_exchanged   two cameras show what the other one showed before
-    camera_channels    red and blue are exchanged, compared with before
+    camera_exchanged   two cameras show what the other one showed before, or in known images
+    camera_channels    red and blue are exchanged, compared with before, or with known images
 
-No checkpoint has statistics of images. So cameras that were wrong from the first call on, and those that show much the
-same, are beyond this.
+No checkpoint has such images. Without them (known_cameras.py), cameras that were wrong from the first call on are
+beyond this; those that show much the same always are.
 """
 
 import itertools
@@ -35,6 +35,7 @@ READING = "reading"  # of a result, for a server, which knows the robots apart
 NEAR, FAR = 0.25, 2.0  # margins, in widths of the training range on either side of it: beyond the latter is far
 SUSTAINED = 20  # calls
 FROZEN = 5  # calls
+GRID = 12  # pixels of an image that are looked at, in each direction
 REPEAT_SECONDS = 60.0  # until the log says the same of the same joint or camera again
 MOVED = 0.025  # widths of the training range of a value of the state: then the robot isn't where it was
 DARK = bytes(range(8))  # grey levels of a black image
@@ -79,6 +80,24 @@ class Sample:
         return Sample, (self.shape, self.pixels, None, self.whole)
 
 
+class Comparison:
+    """Of one call's images with known ones: made when it is wanted, and when it is sent to another process."""
+
+    __slots__ = ("_compare", "_notes")
+
+    def __init__(self, compare: Callable[[], tuple[Note, ...]] | None, notes: tuple[Note, ...] = ()) -> None:
+        self._compare, self._notes = compare, notes
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        if self._compare is not None:
+            self._notes, self._compare = self._compare(), None
+        return self._notes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Comparison, (None, self.notes)
+
+
 class Reading(NamedTuple):
     """Of one call.
 
@@ -88,6 +107,7 @@ class Reading(NamedTuple):
     actions  the farthest value of each action that is far outside
     clipped  whether the actions were clipped
     images   by camera, under the robot's own key
+    known    how they compare with known images
     """
 
     state: Sequence[float]
@@ -96,6 +116,7 @@ class Reading(NamedTuple):
     actions: tuple[Outside, ...] = ()
     clipped: bool = False
     images: Mapping[str, Sample] = {}
+    known: Comparison | None = None
 
 
 class Watch:
@@ -167,7 +188,8 @@ class Watch:
 
     def _of_cameras(self, reading: Reading) -> list[Note]:
         if not self._remembers:
-            return [note for name, one in reading.images.items() for note in _black(name, one)]
+            known = [] if reading.known is None else reading.known.notes
+            return [*known, *(note for name, one in reading.images.items() for note in _black(name, one))]
         return self._cameras.notes(reading)
 
 
@@ -245,6 +267,7 @@ class CameraWatch:
         self._names: tuple[str, ...] = ()
         self._before: np.ndarray = np.empty((0, 0), np.float32)  # [C, pixels]: their images, a mean of the last ones
         self._suspected: list[Note] = []  # by the last comparison
+        self._by_known: tuple[Note, ...] = ()  # in the call before, compared with known images
 
     def notes(self, reading: Reading) -> list[Note]:
         """What there is to say of a call's images."""
@@ -269,10 +292,19 @@ class CameraWatch:
                         "camera's image moved",
                     )
                 )
+        if reading.known is not None and (self._by_known or self._calls % COMPARED_EVERY == 0):
+            found += self._compared_with_known(reading.known.notes)
         if self._suspected or self._calls % COMPARED_EVERY == 0:
-            found += self._compared(images)
+            said = {(note.kind, note.names) for note in found}
+            found += [note for note in self._compared(images) if (note.kind, note.names) not in said]
         self._calls += 1
         return found
+
+    def _compared_with_known(self, notes: tuple[Note, ...]) -> list[Note]:
+        """In the first call at once, as the robot hasn't moved; then what two comparisons show."""
+        confirmed = [note for note in notes if self._calls == 0 or note in self._by_known]
+        self._by_known = notes
+        return confirmed
 
     def _changed(self, name: str, one: Sample, state: Sequence[float], found: list[Note]) -> bool:
         """Whether the image isn't the last one; adds what can be said of it alone."""

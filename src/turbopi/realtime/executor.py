@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 OnEmpty = Literal["hold", "slow_down", "raise"]
 MAX_CONTROL_HZ = 10_000
+_HELD_S = 0.5  # that the robot holds until the log says so
 
 
 class RealTimeExecutor:
@@ -130,10 +131,12 @@ class RealTimeExecutor:
         self._fresh_at: deque[float] = deque(maxlen=1024)  # when actions were given out
         self._called_at: float | None = None  # the last call of next_action
         self._empty_at: float | None = None  # the first control step without an action since the last one with one
+        self._held_since: float | None = None  # if the log has said that the robot holds
         self._stretched = False  # the last command was "slowed"
         self._anew = True  # a server that keeps the running chunk must forget it
         self._kept_at: int | None = None  # which one that is: actions before its observation
         self.last_error: BaseException | None = None  # what the policy raised last
+        self._failing: str | None = None  # its text, until the policy answers again
 
     # --- the policy ---------------------------------------------------------------------------------------------------
 
@@ -177,6 +180,7 @@ class RealTimeExecutor:
             self._delays.begin(delay)
             self._warm_seconds = self._clock() - began
             self._empty_at = None
+            self._answers()
 
     def _learn(self, result: Any) -> RunningChunk | None:
         """What the first answer of a warm-up shows. Raises ConfigError."""
@@ -269,7 +273,7 @@ class RealTimeExecutor:
         """A new episode: what is left of the last one is dropped, and its answer, should it still come."""
         with self._lock:
             self._queue.reset()
-            self._called_at = self._empty_at = None
+            self._called_at = self._empty_at = self._held_since = None
             self._stretched = False
             self._anew = True
             self._fresh_at.clear()
@@ -394,6 +398,7 @@ class RealTimeExecutor:
             entry.outcome = "failed"
         else:
             result, seconds = future.result()
+            self._answers()
             self._journal.latencies_ms.append(seconds * 1e3)
             self._journal.note(entry.chunk, result)
             if now - taken_at > self._max_age:
@@ -410,9 +415,14 @@ class RealTimeExecutor:
             logger.warning("chunk %d was dropped: %s", entry.chunk, self._queue.last_problem)
 
     def _failed(self, error: BaseException) -> None:
-        if str(error) != str(self.last_error):
+        if str(error) != self._failing:
             logger.warning("the policy failed: %s", _named(error))
-        self.last_error = error
+        self.last_error, self._failing = error, str(error)
+
+    def _answers(self) -> None:
+        if self._failing is not None:
+            logger.warning("the policy answers again")
+        self._failing = None
 
     def _slowed(self) -> Command | None:
         """A command half way to the next action, before every action as long as the policy is late."""
@@ -432,7 +442,9 @@ class RealTimeExecutor:
         if action is None:
             return None
         self._fresh_at.append(now)
-        self._empty_at = None
+        if self._held_since is not None:
+            logger.warning("the robot moves again, after %.1f s", now - self._held_since)
+        self._empty_at = self._held_since = None
         return Command("fresh", action.values, self._queue.remaining, action.chunk, action.row, action.takes_over)
 
     def _empty(self, now: float) -> Command:
@@ -444,6 +456,10 @@ class RealTimeExecutor:
             step = self._queue.steps - 1
             text = f"no action for control step {step}: {self._why_empty()}; the robot must stop now"
             raise OutOfActions(text) from self.last_error
+        moves = kind == "held" and not self._way.stands_still
+        if moves and self._held_since is None and now - self._empty_at >= _HELD_S:
+            self._held_since = self._empty_at
+            logger.warning("the robot holds: %s", self._why_empty())
         return Command(kind, held_values(self._hold, last), 0)
 
     def _may_wait(self, now: float, since: float) -> bool:

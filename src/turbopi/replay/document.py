@@ -122,6 +122,11 @@ class Verdict(Struct, frozen=True):
     text: str
     hints: list[str]
 
+    @property
+    def passed(self) -> bool:
+        """Nothing shows a mistake."""
+        return self.level != "differs" and not self.hints
+
 
 class ReplayDocument(Struct, frozen=True):
     """replay.json."""

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from turbopi.checkpoint import Checkpoint
+from turbopi.policy.known_cameras import KnownCameras
 from turbopi.replay.compare import (
     HELD,
     NEVER_MOVED,
@@ -28,6 +29,8 @@ from turbopi.replay.run import Replay, Replayed, Settings
 from turbopi.support.errors import ConfigError
 from turbopi.support.provenance import provenance
 from turbopi.support.text import significant
+
+CAMERAS = "cameras.npz"  # what each camera shows, for `turbopi serve --known-cameras`
 
 WORST = 4  # moments that are shown
 
@@ -87,10 +90,15 @@ class Report:
         self._checkpoints.append(second.checkpoint)
 
     def write(self, folder: Path) -> ReplayDocument:
-        """Write the report; returns its document."""
+        """Write the report; returns its document. CAMERAS are written if nothing shows a mistake, else removed."""
         document = self.document()
         material = Material(self._compared, self._rows, self._observations, self._dataset.action_names)
         write_report(folder, document, material)
+        known = KnownCameras.of_samples(self._compared[0].run.cameras) if document.verdict.passed else None
+        if known is None:
+            (folder / CAMERAS).unlink(missing_ok=True)
+        else:
+            known.save(folder / CAMERAS)
         return document
 
     def document(self) -> ReplayDocument:

@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.policy.history import refuse_memory
 from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.readings import Checks
+from turbopi.policy.watch import Sample
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
 from turbopi.replay.keys import KeyMap, join_keys
@@ -49,6 +52,7 @@ class Replayed:
     reach        how many units beside the middle hold nearly all of the training's actions
     call_ms      of each call of the policy, a batch's counted once
     variations   {name: float64[n, H, d]}, the chunks of `changed`, indices of moments
+    cameras      a few pixels of every moment's images, by the robot's own key
     """
 
     about: Mapping[str, Any]
@@ -65,6 +69,7 @@ class Replayed:
     call_ms: Sequence[float]
     changed: Sequence[int]
     variations: Mapping[str, np.ndarray]
+    cameras: Mapping[str, Sequence[Sample]]
 
     @property
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
@@ -141,6 +146,7 @@ class Replay:
         refuse_memory(policy.metadata, "a replay")
         self.policy, self.dataset, self.settings = policy, dataset, settings
         self.horizon = policy.config.model.action_horizon
+        self._checks = Checks(policy.pipeline, NormStats())  # for its readings of the images
         dataset.wanted = None
         self._first = self._read_first(episodes[0])
         self.keys = join_keys(policy, self._first.observation, settings.renames, settings.task)
@@ -233,6 +239,7 @@ class Replay:
             call_ms,
             changed,
             {name: np.stack(chunks) for name, chunks in varied.items() if chunks},
+            _by_camera(found),
         )
 
     def observation_at(self, episode: Episode, step: int) -> dict[str, Any]:
@@ -267,6 +274,7 @@ class Replay:
     def _answer(self, moment: Moment, observation: Mapping[str, Any], chunk: np.ndarray) -> "_Answer":
         pipeline, model = self.policy.pipeline, self.policy.config.model
         one = pipeline.see(observation, resize=False)
+        reading = self._checks.reading(one)
         pipeline.read(one)
         zeros = np.zeros((model.action_horizon, model.action_dim), np.float32)
         middle = pipeline.after(zeros, one.state)["actions"][0, : self.width]
@@ -277,6 +285,7 @@ class Replay:
             chunk,
             middle,
             np.array(one.robot.state, np.float64),
+            {} if reading is None else {name: Sample(each.shape, each.pixels) for name, each in reading.images.items()},
         )
 
     def _padded(self, recorded: np.ndarray) -> np.ndarray:
@@ -300,6 +309,15 @@ class _Answer:
     chunk: np.ndarray
     middle: np.ndarray
     state: np.ndarray
+    images: Mapping[str, Sample]
+
+
+def _by_camera(answers: Sequence[_Answer]) -> dict[str, list[Sample]]:
+    found: dict[str, list[Sample]] = {}
+    for answer in answers:
+        for name, each in answer.images.items():
+            found.setdefault(name, []).append(each)
+    return found
 
 
 def _batches(moments: Iterator[Moment], size: int) -> Iterator[list[Moment]]:

@@ -64,6 +64,7 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     tokenizer: str | None = None
     default_prompt: str | None = None
     out_of_range: str = "warn"
+    known_cameras: str | None = None
     strict: bool = False
     warmup: bool = True
     replicas: int | None = None
@@ -107,6 +108,7 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             robot=self.robot,
             strict=self.strict,
             out_of_range=self.out_of_range,  # type: ignore[arg-type]  # checked there
+            known_cameras=self.known_cameras,
         )
 
     def fleet(self) -> FleetOptions:
