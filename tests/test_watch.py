@@ -396,8 +396,13 @@ def test_known_cameras_show_a_mistake_in_the_first_call(fixed: Fixed, cameras_fi
     policy.reset()
     (note,) = notes_in(policy.infer({**seen, BASE: seen[BASE][..., ::-1].copy()}, seed=0))
     assert (note.kind, note.names) == ("camera_channels", (BASE,)) and str(cameras_file) in note.text
-    rows = policy.infer_batch([exchanged, seen], seed=0)
-    assert [kinds(row) for row in rows] == [["camera_exchanged"], []]
+    policy.reset()
+    (note,) = notes_in(policy.infer({**seen, WRIST: seen[WRIST][::-1, ::-1].copy()}, seed=0))
+    assert (note.kind, note.names) == ("camera_turned", (WRIST,)) and "by 180 degrees" in note.text
+    both = {key: image[..., ::-1].copy() for key, image in exchanged.items() if key in (BASE, WRIST)}
+    rows = policy.infer_batch([exchanged, seen, {**seen, **both}], seed=0)
+    found = [["camera_exchanged"], [], ["camera_exchanged", "camera_channels", "camera_channels"]]
+    assert [kinds(row) for row in rows] == found
 
 
 def test_one_image_later_on_that_looks_mistaken_is_no_note(fixed: Fixed, cameras_file: Path) -> None:

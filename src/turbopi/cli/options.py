@@ -337,7 +337,7 @@ class ActingOptions(PolicyOptions):
             "--known-cameras",
             panel=_RUNNING,
             metavar="FILE",
-            help="The cameras.npz that `turbopi replay` wrote: cameras that are exchanged, or BGR, are noted from the "
+            help="The cameras.npz that `turbopi replay` wrote: exchanged, BGR or turned cameras are noted from the "
             "first call on.",
         ),
     ] = None

@@ -153,7 +153,7 @@ def replay_command(
     output.line(f"wrote {report}: replay.html, its plots, {DOCUMENT}")
     if (report / CAMERAS).is_file():
         output.line(
-            f"next: turbopi serve … --known-cameras {report / CAMERAS} notes cameras that are exchanged, or BGR, from "
+            f"next: turbopi serve … --known-cameras {report / CAMERAS} notes exchanged, BGR or turned cameras from "
             "the robot's first call on"
         )
     output.document(document)

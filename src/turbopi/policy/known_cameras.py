@@ -76,20 +76,25 @@ class KnownCameras:
             return ()
         rows = [self._rows[name] for name in there]
         pixels = np.frombuffer(b"".join([images[name].pixels for name in there]), np.uint8)
-        now = _fewer(pixels.reshape(len(there), _SIZE))
-        found, exchanged = [], set()
-        away = self._images.distances(now)[:, rows].tolist()
+        every = pixels.reshape(len(there), _SIZE)
+        now, turned = _fewer(every), _fewer(every.reshape(len(there), -1, 3)[:, ::-1].reshape(every.shape))
+        away, away_turned = (self._images.distances(images)[:, rows].tolist() for images in (now, turned))
+        found, shows = [], {i: i for i in range(len(there))}  # of each camera, which one it shows
         for i, j in itertools.combinations(range(len(there)), 2):
             if away[i][i] + away[j][j] > CLEARLY * (away[i][j] + away[j][i]):
-                exchanged |= {i, j}
+                shows[i], shows[j] = j, i
                 text = f"cameras {there[i]} and {there[j]} each show what the other one shows in {self.where}"
                 found.append(Note("camera_exchanged", (there[i], there[j]), f"{text}: are they exchanged?"))
         colours = _red_minus_blue(now)
-        as_they_are, turned = (self._colours.distances(both)[:, rows].tolist() for both in (colours, -colours))
-        for i, row in enumerate(rows):
-            if i not in exchanged and self._coloured[row] and as_they_are[i][i] > CLEARLY * turned[i][i]:
-                text = f"red and blue of camera {there[i]} are exchanged, compared with {self.where}: is it BGR?"
-                found.append(Note("camera_channels", (there[i],), text))
+        as_sent, exchanged = (self._colours.distances(both)[:, rows].tolist() for both in (colours, -colours))
+        for i, other in shows.items():
+            name = there[i]
+            if away[i][other] > CLEARLY * away_turned[i][other]:
+                text = f"the image of camera {name} is turned by 180 degrees, compared with {self.where}"
+                found.append(Note("camera_turned", (name,), text))
+            elif self._coloured[rows[other]] and as_sent[i][other] > CLEARLY * exchanged[i][other]:
+                text = f"red and blue of camera {name} are exchanged, compared with {self.where}: is it BGR?"
+                found.append(Note("camera_channels", (name,), text))
         return tuple(found)
 
 

@@ -78,7 +78,7 @@ class UnifiedPolicy:
         progress: show a bar while the weights load.
         out_of_range: what becomes of actions far outside the training range: "warn", "clip" or "refuse", with an
             ActionError (docs/safety.md).
-        known_cameras: the cameras.npz that `turbopi replay` wrote: cameras that are exchanged, or BGR, are then noted
+        known_cameras: the cameras.npz that `turbopi replay` wrote: exchanged, BGR or turned cameras are then noted
             from the first call on.
         strict: refuse calls that `warmup` didn't cover, with an ObservationError, instead of compiling while a robot
             moves.

@@ -11,6 +11,7 @@ A note says what is wrong in this call; what is remembered is from the calls sin
     camera_size        it has another resolution than before
     camera_exchanged   two cameras show what the other one showed before, or in known images
     camera_channels    red and blue are exchanged, compared with before, or with known images
+    camera_turned      it is turned by 180 degrees, compared with known images
 
 No checkpoint has such images. Without them (known_cameras.py), cameras that were wrong from the first call on are
 beyond this; those that show much the same always are.

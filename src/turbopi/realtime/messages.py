@@ -19,7 +19,8 @@ PREFIX = "turbopi/"
 NOTES = PREFIX + "notes"  # of an answer: a list of {"kind", "names", "text"}
 NOTE_KINDS = (  # docs/safety.md says when
     *("state_range", "action_range", "action_clipped"),
-    *("camera_black", "camera_frozen", "camera_size", "camera_exchanged", "camera_channels", "memory"),
+    *("camera_black", "camera_frozen", "camera_size", "camera_exchanged", "camera_channels"),
+    *("camera_turned", "memory"),
 )
 MOST_NOTES = 32  # of an answer: others aren't read
 MAX_SESSION = 64  # characters
