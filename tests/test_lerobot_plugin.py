@@ -187,6 +187,26 @@ def test_lerobot_rollout_moves_a_robot_with_the_plugin(ran: Path) -> None:
         assert sent and int(sent[1]) > 0
 
 
+def test_what_lerobots_strategies_record_is_played_again(ran: Path, tmp_path: Path) -> None:
+    policy = ("--policy.type=turbopi", f"--policy.checkpoint={ran / 'mean_std' / 'checkpoint'}")
+    home = {"HF_LEROBOT_HOME": str(tmp_path)}
+    dataset = ("--dataset.single_task=pick", "--dataset.push_to_hub=false", "--dataset.rgb_encoder.vcodec=h264")
+    lasts = "--dataset.num_episodes=1", "--dataset.episode_time_s=1", "--dataset.reset_time_s=1"
+    for strategy, more in (("sentry", ("--dataset.streaming_encoding=true",)), ("episodic", lasts)):
+        name = f"me/rollout_{strategy}"
+        recording = (f"--strategy.type={strategy}", f"--dataset.repo_id={name}", "--dataset.no_stamp=true")
+        options = (*policy, *recording, *dataset, *more, "--use_torch_compile=true")
+        assert moved(in_lerobot(*ROLLOUT, *options, **home)) > 10
+        played = ("--robot.type=fake_arm", f"--dataset.repo_id={name}", "--dataset.episode=0", "--play_sounds=false")
+        assert moved(in_lerobot("-m", "lerobot_cases.cli", "replay", *played, **home)) > 10
+
+
+def test_lerobot_rollout_renames_cameras(ran: Path) -> None:
+    policy = ("--policy.type=turbopi", f"--policy.checkpoint={ran / 'renamed' / 'checkpoint'}")
+    names = {f"observation.images.{own}": f"observation.images.camera{i}" for i, own in ((1, "top"), (2, "wrist"))}
+    assert moved(in_lerobot(*ROLLOUT, *policy, f"--rename_map={json.dumps(names)}")) > 10
+
+
 def test_lerobot_eval_runs_episodes_with_the_plugin(ran: Path, tmp_path: Path) -> None:
     checkpoint = f"--policy.checkpoint={ran / 'mean_std' / 'checkpoint'}"
     done = in_lerobot(
