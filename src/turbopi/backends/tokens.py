@@ -8,16 +8,16 @@ behind the end is dropped, at most `LOOK` - 1 tokens.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import Backend, Sample, StageTimer, Trace
+from turbopi.backends.base import Backend, LoadState, Sample, StageTimer, Trace
 from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.resize import Resizer
 from turbopi.models import family_of
@@ -27,6 +27,9 @@ from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0_fast.reference import Decoding, compacted
 from turbopi.preprocess.pipeline import of_row
 from turbopi.support.errors import ActionError, BackendError, ObservationError
+
+if TYPE_CHECKING:
+    from turbopi.engine.token import JoinedWeights
 
 LOOK = 4
 _FORCED = 16  # tokens whose logits are compared
@@ -119,7 +122,7 @@ class TokensBackend(_Tokens, PyTorchBackend):
 
 @dataclass
 class _Graphs:
-    """Of so many cameras: the inputs' places, the graphs, and the answer."""
+    """Of so many cameras: the inputs' places, the graphs, the answer, and what `step` captured, with its buffers."""
 
     inputs: Observation
     resizer: Resizer | None
@@ -127,6 +130,7 @@ class _Graphs:
     prefix: Graph
     step: Graph
     decoding: Decoding
+    one_token: Callable[[], None]
     horizon: int
 
     @property
@@ -139,19 +143,34 @@ class _Graphs:
 
 
 class CapturedTokensBackend(_Tokens, CapturedBackend):
-    """The reference, its stages through torch.compile where there is a compiler, in CUDA graphs."""
+    """The reference in CUDA graphs: vision and prefix through torch.compile where there is a compiler, and a token by
+    the engine (engine/token.py) where its sizes are for that.
+    """
 
     _graphs: dict[int, _Graphs]  # type: ignore[assignment]
+
+    def load_weights(self, load: LoadState) -> None:
+        super().load_weights(load)
+        self._joined: JoinedWeights | None = None
+        if self._compiles:  # Triton's kernels need a compiler, too
+            from turbopi.engine import token
+
+            if token.refuses(self.config) is None:
+                self._joined = token.JoinedWeights(self.model)
+
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | {"tokens_by": "reference" if self._joined is None else "engine"}
 
     @property
     def _to_compile(self) -> tuple[Callable[..., Any], ...]:
         return self.model.embed_images, self._begin, self.model.step
 
-    def _stage(self, stage: Callable[..., Any]) -> Callable[..., Any]:
-        if stage != self.model.step or not self._compiles:
-            return super()._stage(stage)
-        # matmuls of one row become reductions, which read each weight once, fused with what is around them
-        return compile_stage(stage, dynamic=False, options={"coordinate_descent_tuning": True})
+    def _token_step(self, decoding: Decoding) -> Callable[[], None]:
+        if self._joined is None:
+            return partial(self._velocity, decoding)
+        from turbopi.engine.token import TokenStep
+
+        return TokenStep(self.model, self._joined, decoding)
 
     def _vision(self, observation: Observation, mark: Mark) -> Tensor:
         embedded: Tensor = self._embed_images(observation.images)
@@ -253,9 +272,11 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
             self._prefix_of(inputs, decoding, seen.embedded)
             mark("prefix")
 
+        one_token = self._token_step(decoding)
+
         def step(mark: Mark) -> None:
-            self._velocity(decoding)
+            one_token()
             mark("denoise")
 
         second, third = Graph(prefix, self._pool, self._stream), Graph(step, self._pool, self._stream)
-        return _Graphs(inputs, seen.resizer, seen.graph, second, third, decoding, config.action_horizon)
+        return _Graphs(inputs, seen.resizer, seen.graph, second, third, decoding, one_token, config.action_horizon)

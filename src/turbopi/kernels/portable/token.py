@@ -1,0 +1,166 @@
+"""One token behind a prefix: products of one row, attention of one query, and the choice of the next id.
+
+What a GPU does here is read the weights, each once. So a product's programs ask for theirs before they wait for the row
+that they multiply, and norms, GeGLU and residuals are computed beside. Sums and rows are float32, whatever the weights
+and the cache are. Twin: `Pi0FastModel.step`; engine/token.py launches them.
+"""
+
+import triton
+import triton.language as tl
+
+from turbopi.kernels.dependent_launch import launch_dependents, wait_for_producer
+from turbopi.kernels.portable.activations import gelu_tanh
+from turbopi.kernels.portable.rope import rotated
+
+
+@triton.jit
+def row_product(
+    row, norm, weight, beside, out, rows, width, eps,
+    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr,
+    ROWS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """out [rows] = weight [rows, width] · row [width]; GATED: gelu(that) times `beside` · row; ADD: `out` plus that.
+
+    NORM: the row is first divided by its rms and scaled; it needs BLOCK >= width, and so does GATED.
+    """
+    n = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    k = tl.arange(0, BLOCK)
+    at = n[:, None] * width + k[None, :]
+    there = (n < rows)[:, None] & (k < width)[None, :]
+    part = tl.load(weight + at, there, 0.0)
+    if GATED:
+        other = tl.load(beside + at, there, 0.0)
+    if NORM:
+        scale = tl.load(norm + k, k < width, 0.0).to(tl.float32)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    x = tl.load(row + k, k < width, 0.0)
+    if NORM:
+        x *= tl.rsqrt(tl.sum(x * x, 0) / width + eps) * (1 + scale)
+    total = tl.sum(part.to(tl.float32) * x[None, :], 1)
+    if GATED:
+        total = gelu_tanh(total) * tl.sum(other.to(tl.float32) * x[None, :], 1)
+    else:
+        for start in range(BLOCK, width, BLOCK):
+            there = (n < rows)[:, None] & (k + start < width)[None, :]
+            part = tl.load(weight + at + start, there, 0.0)
+            x = tl.load(row + k + start, k + start < width, 0.0)
+            total += tl.sum(part.to(tl.float32) * x[None, :], 1)
+    if ADD:
+        total += tl.load(out + n, n < rows, 0.0)
+    tl.store(out + n, total, n < rows)
+
+
+@triton.jit
+def attend_places(
+    qkv, cos, sin, keys, values, valid, place, position, partial, most, total, scale,
+    HEADS: tl.constexpr, HALF: tl.constexpr, PLACES: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """Of one head, and a share of the places, the largest score, the sum of the exponentials and the values they weigh.
+
+    qkv [(HEADS + 2) * 2 * HALF]: the queries, and the key and value of this token, which go to `place`, and are seen.
+    partial [shares, HEADS, 2 * HALF], most and total [shares, HEADS]. Of the kernels behind the last id only the one in
+    front may still run, which writes `qkv` alone: so all else is read before the wait.
+    """
+    share, head = tl.program_id(0), tl.program_id(1)
+    t = share * PLACES + tl.arange(0, PLACES)
+    half, both = tl.arange(0, HALF), tl.arange(0, 2 * HALF)
+    own = tl.load(place)
+    at = tl.load(position) * HALF + half
+    c, s = tl.load(cos + at), tl.load(sin + at)
+    before = (t < own)[:, None]
+    first = tl.load(keys + t[:, None] * 2 * HALF + half[None, :], before, 0.0)
+    second = tl.load(keys + t[:, None] * 2 * HALF + HALF + half[None, :], before, 0.0)
+    seen = tl.load(values + t[:, None] * 2 * HALF + both[None, :], before, 0.0)
+    visible = (t == own) | ((t < own) & (tl.load(valid + t, t < own, 0) != 0))
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    query, key = qkv + head * 2 * HALF, qkv + HEADS * 2 * HALF
+    low, up = rotated(tl.load(query + half), tl.load(query + HALF + half), c, s)
+    lower, upper = rotated(tl.load(key + half), tl.load(key + HALF + half), c, s)
+    value = tl.load(key + 2 * HALF + both)
+    dtype = keys.dtype.element_ty
+    lower, upper, value = lower.to(dtype), upper.to(dtype), value.to(dtype)
+    if (own >= share * PLACES) & (own < (share + 1) * PLACES) & (head == 0):
+        tl.store(keys + own * 2 * HALF + half, lower)
+        tl.store(keys + own * 2 * HALF + HALF + half, upper)
+        tl.store(values + own * 2 * HALF + both, value)
+        tl.store(valid + own, 1)
+    new = (t == own)[:, None]
+    low_keys = tl.where(new, lower[None, :], first).to(tl.float32)
+    up_keys = tl.where(new, upper[None, :], second).to(tl.float32)
+    score = (tl.sum(low_keys * low[None, :], 1) + tl.sum(up_keys * up[None, :], 1)) * scale
+    score = tl.where(visible, score, float("-inf"))
+    largest = tl.max(score, 0)
+    weight = tl.where(visible, tl.exp(score - largest), 0.0)
+    weighed = tl.where(new, value[None, :], seen).to(tl.float32)
+    to = share * HEADS + head
+    tl.store(most + to, largest)
+    tl.store(total + to, tl.sum(weight, 0))
+    tl.store(partial + to * 2 * HALF + both, tl.sum(weight[:, None] * weighed, 0))
+
+
+@triton.jit
+def join_shares(
+    partial, most, total, out, shares,
+    HEADS: tl.constexpr, WIDTH: tl.constexpr, SHARES: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """The softmax over all places, of one head: out [HEADS * WIDTH]."""
+    head = tl.program_id(0)
+    share, column = tl.arange(0, SHARES), tl.arange(0, WIDTH)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    there = share < shares
+    at = share * HEADS + head
+    largest = tl.load(most + at, there, float("-inf"))
+    factor = tl.where(largest == float("-inf"), 0.0, tl.exp(largest - tl.max(largest, 0)))
+    sums = tl.sum(factor * tl.load(total + at, there, 0.0), 0)
+    of_share = tl.load(partial + at[:, None] * WIDTH + column[None, :], there[:, None], 0.0)
+    tl.store(out + head * WIDTH + column, tl.sum(factor[:, None] * of_share, 0) / sums)
+
+
+@triton.jit
+def best_of_share(logits, best, where, count, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    """The largest of BLOCK logits, and the first id that has it; NaN is the largest, as in PyTorch."""
+    share = tl.program_id(0)
+    at = share * BLOCK + tl.arange(0, BLOCK)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    logit = tl.load(logits + at, at < count, float("-inf"))
+    logit = tl.where(logit == logit, logit, float("inf"))
+    largest = tl.max(logit, 0)
+    tl.store(best + share, largest)
+    tl.store(where + share, tl.min(tl.where((logit == largest) & (at < count), at, count), 0))
+
+
+@triton.jit
+def choose(
+    best, where, chosen, ids, written, place, position, ends, ended, shares, num_ends,
+    SHARES: tl.constexpr, ENDS: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """Write the best id down, and be ready for the next token."""
+    share, end = tl.arange(0, SHARES), tl.arange(0, ENDS)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    largest = tl.load(best + share, share < shares, float("-inf"))
+    candidates = tl.load(where + share, share < shares, 2**31 - 1)
+    one = tl.min(tl.where(largest == tl.max(largest, 0), candidates, 2**31 - 1), 0).to(tl.int64)
+    at = tl.load(written)
+    tl.store(chosen, one)
+    tl.store(ids + at, one)
+    tl.store(written, at + 1)
+    tl.store(place, tl.load(place) + 1)
+    tl.store(position, tl.load(position) + 1)
+    over = tl.max(((tl.load(ends + end, end < num_ends, -1) == one) & (end < num_ends)).to(tl.int32), 0)
+    tl.store(ended, ((tl.load(ended) != 0) | (over != 0)).to(tl.int8))
+
+
+@triton.jit
+def embed_id(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    """The id's row of the table times `scale`, rounded as the table is."""
+    k = tl.arange(0, BLOCK)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    number = tl.load(table + tl.load(chosen) * width + k, k < width, 0.0)
+    scaled = (number.to(tl.float32) * scale).to(table.dtype.element_ty)
+    tl.store(out + k, scaled.to(tl.float32), k < width)
