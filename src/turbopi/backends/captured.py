@@ -209,14 +209,8 @@ class CapturedBackend(PyTorchBackend):
         keep: bool = False,
     ) -> Answer:
         """Its actions; keep: and all that led to them."""
-        if turn is not self._turn:
-            raise BackendError("another observation was begun before this one was finished")
-        graphs, count = self._captured(cameras), len(tokens)
-        padded = np.zeros((2, self.config.max_prompt_tokens), np.int64)
-        padded[0, :count], padded[1, :count] = tokens, 1
-        on_device = torch.from_numpy(padded).to(self.device)
-        graphs.inputs.tokens.copy_(on_device[:1])
-        graphs.inputs.token_mask.copy_(on_device[1:])
+        graphs = self._captured(cameras)
+        self._give_prompt(turn, graphs.inputs, tokens)
         graphs.inputs.state.copy_(torch.from_numpy(state)[None])
         graphs.prefix.launch()
         timer.mark("prefix")
@@ -224,6 +218,16 @@ class CapturedBackend(PyTorchBackend):
         answer = self._denoise(graphs, cameras, x_1, num_steps, conditioning, keep)
         timer.mark("denoise")
         return answer
+
+    def _give_prompt(self, turn: object, inputs: Observation, tokens: np.ndarray) -> None:
+        """Put it behind the images that `see` has begun on."""
+        if turn is not self._turn:
+            raise BackendError("another observation was begun before this one was finished")
+        padded = np.zeros((2, self.config.max_prompt_tokens), np.int64)
+        padded[0, : len(tokens)], padded[1, : len(tokens)] = tokens, 1
+        on_device = torch.from_numpy(padded).to(self.device)
+        inputs.tokens.copy_(on_device[:1])
+        inputs.token_mask.copy_(on_device[1:])
 
     def _denoise(
         self,

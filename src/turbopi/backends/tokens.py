@@ -26,7 +26,7 @@ from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0_fast.reference import Decoding, compacted
 from turbopi.preprocess.pipeline import of_row
-from turbopi.support.errors import ActionError, BackendError, ObservationError
+from turbopi.support.errors import ActionError, ObservationError
 
 if TYPE_CHECKING:
     from turbopi.engine.token import JoinedWeights
@@ -250,14 +250,8 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
 
     def _started(self, turn: object, cameras: int, tokens: np.ndarray) -> _Graphs:
         """Launch the prefix behind the images that `see` has begun on."""
-        if turn is not self._turn:
-            raise BackendError("another observation was begun before this one was finished")
-        graphs, count = self._graphs[cameras], len(tokens)
-        padded = np.zeros((2, self.config.max_prompt_tokens), np.int64)
-        padded[0, :count], padded[1, :count] = tokens, 1
-        on_device = torch.from_numpy(padded).to(self.device)
-        graphs.inputs.tokens.copy_(on_device[:1])
-        graphs.inputs.token_mask.copy_(on_device[1:])
+        graphs = self._graphs[cameras]
+        self._give_prompt(turn, graphs.inputs, tokens)
         graphs.prefix.launch()
         return graphs
 
