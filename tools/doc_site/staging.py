@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 # what nobody needs to link to: mkdocs.yml has them in its navigation, or building the site fails
-_ROOTS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "docs/dev/**/*.md")
+_ROOTS = ("*.md", "docs/*.md", "docs/dev/**/*.md")
 _LINK = re.compile(r"(?P<before>\]\()(?P<path>[^()\s#]+)(?P<anchor>#[^()\s]*)?(?=\))")
 
 
