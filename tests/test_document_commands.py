@@ -15,7 +15,8 @@ from turbopi.cli import app
 pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots", "unread_settings")
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+FORMS = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+DOCUMENTS = (ROOT / "README.md", ROOT / "SECURITY.md", *FORMS, *sorted((ROOT / "docs").glob("*.md")))
 GROUP = typer.main.get_command(app)
 _BLOCK = re.compile(r"^```[a-z]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"`turbopi ([^`]+)`")

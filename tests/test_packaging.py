@@ -79,6 +79,25 @@ def test_importing_turbopi_keeps_threads_from_spinning(before: str, given: str |
     assert ended.stdout.strip() == seen
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / ".venv-build" / ".done").exists(), reason="needs scripts/check_wheel's .venv-build")
+def test_the_same_files_give_the_same_bytes(tmp_path: Path) -> None:
+    """sdists and wheels of all three packages, built at another place and time, with other permissions."""
+    built: list[dict[str, bytes]] = []
+    for number, mask in enumerate((0o022, 0o077)):
+        out = tmp_path / str(number)
+        environment = {**os.environ, "TZ": ("UTC", "Asia/Tokyo")[number]}
+        command = [ROOT / "scripts" / "build_wheels", out]
+        subprocess.run(command, umask=mask, env=environment, capture_output=True, check=True)
+        built.append({file.name: file.read_bytes() for file in out.iterdir()})
+    assert len(built[0]) == 6 and built[0] == built[1]
+    for name, content in built[0].items():
+        if name.endswith(".whl"):
+            (tmp_path / name).write_bytes(content)
+            with zipfile.ZipFile(tmp_path / name) as archive:
+                assert {file.rsplit("/")[-1] for file in archive.namelist()} >= {"LICENSE", "NOTICE"}, name
+
+
 @pytest.fixture
 def reported(wheel: Path) -> Message:
     """The wheel's metadata: what an index shows."""
@@ -98,6 +117,14 @@ def test_the_metadata_is_complete(reported: Message) -> None:
     versions = (ROOT / "docs" / "dev" / "versions.md").read_text()
     assert pythons and all(f"| {python} |" in versions for python in pythons), "those that tests run with"
     assert set(reported.get_all("Provides-Extra", [])) >= {"cuda", "libero", "tensorrt", "onnx", "ray", "rerun"}
+
+
+def test_the_three_packages_have_one_version() -> None:
+    files = (
+        ROOT / folder / "pyproject.toml" for folder in (".", "packages/turbopi-lab", "plugins/lerobot_policy_turbopi")
+    )
+    versions = {re.findall(r'^version = "(.*)"$', file.read_text(encoding="utf-8"), re.MULTILINE)[0] for file in files}
+    assert len(versions) == 1, versions
 
 
 def test_extras_end_at_what_was_tested(reported: Message) -> None:

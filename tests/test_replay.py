@@ -29,6 +29,7 @@ from turbopi.replay.opening import open_dataset
 from turbopi.replay.page import DOCUMENT, PAGE
 from turbopi.replay.report import CAMERAS, Report
 from turbopi.replay.run import OF_AN_EPISODE, Replay, Replayed, Settings, affordable, select, variations_of
+from turbopi.robots import robot_from_dict
 from turbopi.support.errors import ConfigError, ObservationError
 from turbopi.support.reading import read_document
 
@@ -321,6 +322,23 @@ def steps(**others: np.ndarray) -> dict[str, np.ndarray]:
         "observation/state": np.zeros((3, 8)),
     }
     return {**found, "actions": np.zeros((3, 7)), "prompt": np.array("tidy up")} | others
+
+
+def test_a_state_in_one_array_is_described_once_more(tmp_path: Path) -> None:
+    """LeRobot's datasets have one observation.state, where the robot that is served may have joints and a gripper."""
+    cameras = {"observation/image": "base_0_rgb", "observation/wrist_image": "left_wrist_0_rgb"}
+    data = open_dataset(written(tmp_path / "data", **steps()))
+
+    def keys(state: Mapping[str, int]) -> KeyMap:
+        robot = robot_from_dict({"name": "arm", "cameras": cameras, "state": state, "action_dim": 7})
+        policy = UnifiedPolicy(SMALL_POLICY, device="cpu", robot=robot)
+        return Replay(policy, data, data.episodes, Settings({})).keys
+
+    with pytest.raises(ObservationError, match=r'observation/state\. Describe .* "state": \{"state": 8\}'):
+        keys({"joint_position": 7, "gripper_position": 1})
+    with pytest.raises(ObservationError, match="--rename DATASET_KEY=joint_position"):
+        keys({"joint_position": 6, "gripper_position": 1})
+    assert keys({"state": 8}).joined["state"] == "observation/state"
 
 
 def test_keys_that_fit_nowhere_are_named_with_what_to_do(policy: UnifiedPolicy, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The marked places in documents, and what belongs there."""
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,8 +21,11 @@ def documents(root: Path) -> list[Path]:
     return sorted([*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("benchmarks/**/*.md")])
 
 
-def filled(text: str, root: Path) -> str:
-    """A document's text with its tables written anew. Raises TableError."""
+def filled(text: str, root: Path, folder: Path) -> str:
+    """A document's text with its tables written anew, each with links to its result files. Raises TableError.
+
+    folder  where the document is: links are relative to it
+    """
 
     def written(found: re.Match[str]) -> str:
         name, *files = found["what"].split()
@@ -29,6 +33,8 @@ def filled(text: str, root: Path) -> str:
             raise TableError(f"no table is named {name!r}: there are {', '.join(sorted(TABLES))}")
         table = TABLES[name]
         lines = table.lines(*(_load(root / RESULTS / file, table) for file in files))
+        links = (f"[{file}]({os.path.relpath(root / RESULTS / file, folder)})" for file in files)
+        lines = [*lines, "", f"Raw: {', '.join(links)}"] if files else lines
         return f"<!-- table: {found['what']} -->\n" + "".join(f"{line}\n" for line in lines) + "<!-- end of table -->"
 
     if text.count("<!-- table:") != len(_BLOCK.findall(text)):
@@ -51,7 +57,7 @@ def _wanted(root: Path) -> Iterator[tuple[Path, str, str]]:
         text = document.read_text(encoding="utf-8")
         if "<!-- table:" in text:
             try:
-                yield document, text, filled(text, root)
+                yield document, text, filled(text, root, document.parent)
             except TableError as error:
                 raise TableError(f"{document.relative_to(root)}: {error}") from None
 

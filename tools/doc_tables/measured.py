@@ -53,10 +53,19 @@ def _wanted(result: Result) -> bool:
     return replace(result.job, horizon=usual.horizon, batch=1) == usual
 
 
+def _sources(root: Path) -> list[_File]:
+    return read_document(root / SOURCES, _Sources, ConfigError).files
+
+
+def kernels_of(root: Path) -> dict[str, dict[str, Kernels]]:
+    """Result file, below benchmarks/results -> backend -> its kernels, which the file itself doesn't say."""
+    return {source.file: source.kernels for source in _sources(root)}
+
+
 def measured(root: Path) -> str:
     """The text of data/measured_calls.json; a later file's calls replace an earlier one's of the same kind and job."""
     calls: dict[tuple[object, ...], MeasuredCall] = {}
-    for source in read_document(root / SOURCES, _Sources, ConfigError).files:
+    for source in _sources(root):
         document = read_benchmark(root / RESULTS / source.file)
         for result in document.results:
             if result.backend in source.kernels and _wanted(result):

@@ -1,4 +1,4 @@
-"""Our latency beside other programs': README's table and plot, both from the outputs in h200_2026-11-28_peers/.
+"""Our latency beside other programs': docs/performance.md's table, README's plot, from h200_2026-11-28_peers/.
 
 A run is one file as its program wrote it: ours a benchmark (.json), the others a JSON object a line (.jsonl) or a line
 of text each (.txt). What was built how: the README beside them.

@@ -106,7 +106,7 @@ def join_keys(
     try:
         policy.pipeline.before(made.observation(recorded, task))
     except ObservationError as error:
-        raise ObservationError(_advice(policy, made, theirs, str(error))) from error
+        raise ObservationError(_advice(policy, made, recorded, theirs, str(error))) from error
     return made
 
 
@@ -136,16 +136,28 @@ def _join_state(
 ) -> None:
     """The robot's only key of numbers is the dataset's state, whatever either is called."""
     numbers = [key for key in joined if key not in tuple(cameras)]
-    states = [key for key in theirs if _last(key) in _STATES and np.ndim(find(recorded, key)) == 1]
+    states = _states(recorded, theirs)
     if len(numbers) == 1 and joined[numbers[0]] is None and len(states) == 1:
         joined[numbers[0]] = states[0]
 
 
-def _advice(policy: UnifiedPolicy, made: KeyMap, theirs: list[str], problem: str) -> str:
+def _states(recorded: Mapping[str, Any], theirs: Iterable[str]) -> list[str]:
+    return [key for key in theirs if _last(key) in _STATES and np.ndim(find(recorded, key)) == 1]
+
+
+def _advice(policy: UnifiedPolicy, made: KeyMap, recorded: Mapping[str, Any], theirs: list[str], problem: str) -> str:
     text = f"the dataset's observations don't fit robot {_robot(policy)}: {problem}"
     if not made.absent:
         return text
     example, key = policy.example_observation(), made.absent[0]
+    absent, states = [find(example, one) for one in made.absent], _states(recorded, theirs)
+    numbers = sum(np.size(one) for one in absent)
+    if len(absent) > 1 and len(states) == 1 and np.size(find(recorded, states[0])) == numbers:
+        return (
+            f"{text}. The dataset seems to have {listed(made.absent)} in one array, {states[0]}. Describe the robot "
+            f'once more, with "state": {{"{_last(states[0])}": {numbers}}}, and give that file as --robot '
+            "(docs/replay.md)"
+        )
     free = made.unread if np.ndim(find(example, key)) == 3 else ()
     return (
         f"{text}. The dataset has {listed(theirs)}; nothing in it is called {listed(made.absent)}. Say which is which: "

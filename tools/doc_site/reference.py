@@ -1,13 +1,15 @@
-"""docs/api_reference.md, written from the docstrings of the public names (`turbopi.__all__`).
+"""The Python reference, written from the docstrings of every public name (docs/api.md says which are).
 
 Signatures and docstrings are read from the source, so that they don't depend on the Python that writes them.
 """
 
 import ast
+import importlib
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import turbopi
@@ -15,19 +17,26 @@ from turbopi import config
 from turbopi.checkpoint import Checkpoint
 from turbopi.support import errors
 
-DOCUMENT = Path("docs") / "api_reference.md"
 _INTRODUCTION = """# Python reference
 
-Written by `scripts/tables` from the docstrings. `from turbopi import …` gives every name here but those of
-[Related classes](#related-classes). What of it stays the same between versions: [api.md](api.md). A server and clients:
-[serving.md](serving.md); your own robot: [robots.md](robots.md).
+Written from the docstrings of this version. What of it stays the same between versions: [What is promised](api.md). A
+server and clients: [Serving](serving.md); your own robot: [Robots](robots.md).
 
 In shapes: H is the action horizon (actions in a chunk), `action_dim` the model's width of an action, d the robot's, B a
 batch, h and w an image's height and width.
 """
 _FIRST = ("UnifiedPolicy", "open_checkpoint", "PolicyConfig", "Robot", "RobotInputs")
 _RELATED = (Checkpoint, config.ModelConfig, config.Normalization)
+# module -> its public names, what a reader looks for first
+_MODULES: dict[str, tuple[str, ...]] = {
+    "turbopi.realtime": ("RealTimeExecutor", "RealTimeClient"),
+    "turbopi.serve": ("run", "running", "PolicyServer", "ServerOptions"),
+    "turbopi.robots": ("create_robot", "load_robot"),
+    "turbopi.recordings": ("iter_recording", "load_observation"),
+    "turbopi.realtime.wire": ("pack", "unpack"),
+}
 _ITEM = re.compile(r"(?P<name>[\w.*]+(?:, [\w.*]+)*)(?:: +| {2,})(?P<text>\S.*)")
+_DOCUMENT = re.compile(r"\bdocs/(\w+\.md)")  # as docstrings name one
 _Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -36,28 +45,37 @@ def reference() -> str:
     public = [name for name in turbopi.__all__ if not name.startswith("_") and name != "errors"]
     raised = [name for name in public if issubclass(_class(name), Exception)]
     rest = [name for name in public if name not in (*_FIRST, *raised)]
-    parts = [_INTRODUCTION]
-    parts += [_described(getattr(turbopi, name), "##") for name in (*_FIRST, *rest)]
-    parts.append("## Related classes\n")
-    parts += [_described(one, "###") for one in _RELATED]
-    parts.append("## Errors\n\n`turbopi.errors` has them, too.\n")
+    parts = [_INTRODUCTION, "## turbopi\n"]
+    parts += [_described(getattr(turbopi, name), "###") for name in (*_FIRST, *rest)]
+    parts.append("### Related classes\n")
+    parts += [_described(one, "####") for one in _RELATED]
+    parts.append("## turbopi.errors\n\n`from turbopi import …` has them, too.\n")
     parts += [f"- **`{name}`**: {_line(getattr(turbopi, name).__doc__)}{_bases(name)}" for name in raised]
+    for name, first in _MODULES.items():
+        parts += _module(importlib.import_module(name), first, {*_FIRST, *rest})
     return "\n".join(part.rstrip("\n") + "\n" if not part.startswith("- ") else part for part in parts) + "\n"
 
 
-def write_reference(root: Path) -> list[Path]:
-    """Write the document anew; returns it if it changed."""
-    if not stale_reference(root):
-        return []
-    (root / DOCUMENT).write_text(reference(), encoding="utf-8")
-    return [root / DOCUMENT]
+def _module(module: ModuleType, first: tuple[str, ...], described: set[str]) -> Iterator[str]:
+    """Its own text, and a section for each public name that has none yet."""
+    yield f"\n## {module.__name__}\n\n{_markdown(inspect.getdoc(module) or '')}\n"
+    public: list[str] = getattr(module, "__all__", list(first))
+    for name in sorted({*public} - described, key=lambda name: (name not in first, public.index(name))):
+        found = getattr(module, name)
+        is_code = inspect.isfunction(found) or inspect.isclass(found)
+        yield _described(found, "###") if is_code else _value(module, name, found)
 
 
-def stale_reference(root: Path) -> list[str]:
-    """A line if the document isn't what the docstrings say."""
-    file = root / DOCUMENT
-    fresh = file.is_file() and file.read_text(encoding="utf-8") == reference()
-    return [] if fresh else [f"{DOCUMENT} isn't what the docstrings say; run scripts/tables"]
+def _value(module: ModuleType, name: str, found: object) -> str:
+    """The section of a name that is neither a class nor a function: its type, or what it stands for."""
+    for file in sorted(Path(module.__file__ or "").parent.glob("*.py")):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == name:
+                keys = f"\n\nIts keys: {', '.join(f'`{key}`' for key in found)}." if isinstance(found, Mapping) else ""
+                return f"### {name}\n\n```python\n{name}: {ast.unparse(node.annotation)}\n```{keys}\n"
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+                return f"### {name}\n\n```python\n{ast.unparse(node)}\n```\n"
+    raise ValueError(f"{module.__name__}.{name} has no assignment in its folder; expected one to read its type from")
 
 
 def _class(name: str) -> type:
@@ -77,7 +95,7 @@ def _line(docstring: str | None) -> str:
 
 def _described(one: Any, heading: str) -> str:
     """The section of a class or function."""
-    file = Path(inspect.getsourcefile(one) or "")
+    file = Path(inspect.getsourcefile(inspect.unwrap(one)) or "")  # behind a decorator
     source = file.read_text(encoding="utf-8")
     (node,) = (n for n in ast.parse(source).body if getattr(n, "name", None) == one.__name__)
     if isinstance(node, ast.ClassDef):
@@ -167,7 +185,7 @@ def _markdown(docstring: str) -> str:
             found.append("\n".join(["```", *body, "```"]))
         else:
             found.append("\n".join(line.strip() for line in lines))
-    return "\n\n".join(found)
+    return _DOCUMENT.sub(r"[\g<0>](\g<1>)", "\n\n".join(found))
 
 
 def _items(lines: list[str]) -> list[tuple[str, str]] | None:
@@ -178,13 +196,13 @@ def _items(lines: list[str]) -> list[tuple[str, str]] | None:
     items: list[tuple[str, str]] = []
     for line in lines:
         match = _ITEM.fullmatch(line)
-        alone = re.fullmatch(r"[a-z]\w*(, [a-z]\w*)+", line)  # names, whose text follows
+        alone = re.fullmatch(r"[a-z]\w*(, [a-z]\w*)*", line)  # names, whose text follows
         if match is not None:
             items.append((match["name"], " ".join(match["text"].split())))
         elif alone is not None:
             items.append((line, ""))
         elif items and line.startswith(" "):
-            items[-1] = (items[-1][0], f"{items[-1][1]} {line.strip()}".strip())
+            items[-1] = (items[-1][0], f"{items[-1][1]} {' '.join(line.split())}".strip())
         else:
             return None
-    return items
+    return items if all(text for _, text in items) else None
