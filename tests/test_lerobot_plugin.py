@@ -14,6 +14,7 @@ from typing import Any
 
 import memory_golden
 import numpy as np
+import pi0_fast_golden
 import pytest
 import smolvla_golden
 from checkpoint_helpers import edit_json
@@ -95,6 +96,46 @@ def test_smolvlas_actions_are_lerobots(ran_smolvla: Path, name: str) -> None:
     for key in [*runs, "selected_actions"]:
         steps = min(len(found[key]), len(stored[key]))
         assert rms(found[key][:steps], stored[key][:steps]) <= 2e-5, key
+
+
+PI0_FAST = ("quantiles_empty_camera", "relative")
+NO_TOKENIZER = """\
+class UniversalActionProcessor:
+    @classmethod
+    def register_for_auto_class(cls, *_): ...
+    @classmethod
+    def from_pretrained(cls, *_, **__):
+        return cls()
+"""  # in place of the owners' code, which LeRobot's processors load, and use in training alone
+
+
+@pytest.fixture(scope="module")
+def ran_pi0_fast(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `ran`, of Pi0-FAST's cases that LeRobot's main branch saved: their folders have both tokenizers."""
+    folder = tmp_path_factory.mktemp("pi0_fast")
+    for name in PI0_FAST:
+        (folder / name).mkdir()
+        checkpoint = pi0_fast_golden.make_folder(name, folder / name / "checkpoint", broken_answers="owners")
+        (checkpoint / "action_tokenizer" / "processing_action_tokenizer.py").write_text(NO_TOKENIZER)
+
+        def tokenize_by_the_folder(content: Any, tokenizer: str = str(checkpoint / "tokenizer")) -> None:
+            (step,) = (one for one in content["steps"] if one["registry_name"] == "action_tokenizer_processor")
+            step["config"]["paligemma_tokenizer_name"] = tokenizer
+
+        edit_json(checkpoint / "policy_preprocessor.json", tokenize_by_the_folder)
+        for file in ("case.json", "inputs.npz"):
+            shutil.copy(pi0_fast_golden.GOLDEN / name / file, folder / name)
+    done = in_lerobot("-m", "lerobot_cases.plugin", folder)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return folder
+
+
+@pytest.mark.parametrize("name", PI0_FAST)
+def test_pi0_fasts_actions_are_lerobots(joining: tuple[Path, tuple[str, ...]], ran_pi0_fast: Path, name: str) -> None:
+    found, golden = np.load(ran_pi0_fast / name / "plugin.npz"), pi0_fast_golden.runs(name)
+    for run in range(len(golden)):
+        assert rms(found[f"{run}/actions"], golden.actions(run)) <= 2e-5
+    np.testing.assert_array_equal(found["selected_actions"], found["0/actions"][: len(found["selected_actions"])])
 
 
 def test_memory_is_lerobots_call_by_call(joining: tuple[Path, tuple[str, ...]], tmp_path: Path) -> None:

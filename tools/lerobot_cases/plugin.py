@@ -3,8 +3,8 @@
     PYTHONPATH=tools:src:plugins/lerobot_policy_turbopi/src \\
         .venv-lerobot/bin/python -m lerobot_cases.plugin FOLDER
 
-Each FOLDER/*/ is a case of tests/golden_lerobot or golden_smolvla: checkpoint/ with its weights, inputs.npz, case.json.
-It gets plugin.npz, everything by LeRobot's processors, loaded as its commands load them:
+Each FOLDER/*/ is a case of tests/golden_lerobot, golden_smolvla or golden_pi0_fast: checkpoint/ with its weights,
+inputs.npz, case.json. It gets plugin.npz, everything by LeRobot's processors, loaded as its commands load them:
 
     {run}/actions            the plugin's chunk from the stored noise, float32 [H, d], un-normalised
     selected_actions         the plugin's, one by one from select_action, the stored noise for each chunk
@@ -36,7 +36,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     checkpoint = folder / "checkpoint"
     config = TurboPiConfig(checkpoint=str(checkpoint), precision="f32", backend="pytorch", device="cpu")
     policy, pre, post = _load(config)
-    noise = torch.from_numpy(inputs["noise"])[None]
+    noise = torch.from_numpy(inputs["noise"])[None] if "noise" in inputs else None  # Pi0-FAST draws none
     found: dict[str, torch.Tensor] = {}
     for index, wanted in enumerate(case["runs"]):
         batch = pre(_request(inputs, wanted["observation"]))
@@ -48,7 +48,7 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     torch.manual_seed(3)
     found["seeded"] = post(policy.predict_action_chunk(pre(_request(inputs, 0))))[0]
     own = PreTrainedConfig.from_pretrained(checkpoint)
-    if not own.use_peft and case.get("vision_heads") == VISION_HEADS:
+    if not own.use_peft and case.get("vision_heads") == VISION_HEADS and noise is not None:
         own.pretrained_path = checkpoint
         config = TurboPiConfig(checkpoint=str(checkpoint), backend="pytorch", device="cpu")
         for name, one in (("lerobot_seeded", own), ("lerobot_bf16", replace(own, dtype="bfloat16")), ("bf16", config)):
@@ -85,8 +85,8 @@ def _request(inputs: dict[str, np.ndarray], index: int) -> dict[str, Any]:
 
 def main() -> None:
     cases = sorted(Path(sys.argv[1]).glob("*/case.json"))
-    if not all(json.loads(case.read_text()).get("kind") == "smolvla" for case in cases):  # which is small by its config
-        shrink()
+    if not all(json.loads(case.read_text()).get("kind") in ("smolvla", "pi0_fast") for case in cases):
+        shrink()  # of those two Turbo-Pi's alone runs, and the files have what it needs
     torch.use_deterministic_algorithms(True)
     for case in cases:
         found: dict[str, Any] = run(case.parent)

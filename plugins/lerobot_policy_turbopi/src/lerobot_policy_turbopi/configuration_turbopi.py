@@ -13,7 +13,7 @@ from lerobot_policy_turbopi.real_time import MODES
 from lerobot_policy_turbopi.server import PROCESSORS, connect
 from turbopi.support.errors import CheckpointError, ConfigError
 
-KINDS = ("pi05", "pi0", "smolvla")
+KINDS = ("pi05", "pi0", "smolvla", "pi0_fast")
 SERVERS = {  # options that a server decides about, and what they are when they aren't given
     "checkpoint": None,
     "backend": "auto",
@@ -23,18 +23,21 @@ SERVERS = {  # options that a server decides about, and what they are when they 
     "warmup": True,
 }
 NO_TRAINING = (
-    "Turbo-Pi runs policies, it doesn't train them: train with --policy.type=pi05, pi0 or smolvla, and run the "
+    "Turbo-Pi runs policies, it doesn't train them: train with --policy.type=pi05, for one, and run the "
     "checkpoint with --policy.type=turbopi --policy.checkpoint=…"
 )
 
 
-_OTHER_NAMES = {("smolvla", "num_inference_steps"): "num_steps"}  # of the checkpoint's config
+_OTHER_NAMES = {  # of the checkpoint's config
+    ("smolvla", "num_inference_steps"): "num_steps",
+    ("pi0_fast", "num_inference_steps"): "max_decoding_steps",
+}
 
 
 @PreTrainedConfig.register_subclass("turbopi")
 @dataclass
 class TurboPiConfig(PreTrainedConfig):
-    """How Turbo-Pi runs a LeRobot checkpoint of type pi05, pi0 or smolvla.
+    """How Turbo-Pi runs a LeRobot checkpoint of type pi05, pi0, smolvla or pi0_fast.
 
     checkpoint           its folder, or its name on the Hugging Face hub (owner/name, with `pretrained_revision`)
     server               in place of a checkpoint: ws://HOST:PORT, a `turbopi serve CHECKPOINT` that computes for this
@@ -43,7 +46,7 @@ class TurboPiConfig(PreTrainedConfig):
     precision            "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
     quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json or
                          turbopi_int8.json in its folder
-    num_inference_steps  denoising steps a chunk; None: the checkpoint's
+    num_inference_steps  denoising steps a chunk, of pi0_fast tokens of an answer at most; None: the checkpoint's
     n_action_steps       actions of a chunk that are executed before the next one; None: the checkpoint's, of a server
                          all of the chunk
     rtc_mode             with `--inference.type=rtc`: "guided" as LeRobot computes it, or "trained", which holds the
@@ -97,7 +100,7 @@ class TurboPiConfig(PreTrainedConfig):
 
     def _described(self) -> Any:
         """The checkpoint's own config."""
-        import lerobot.policies  # noqa: F401 - registers pi05, pi0 and smolvla
+        import lerobot.policies  # noqa: F401 - registers pi05 and the others
 
         try:
             described = PreTrainedConfig.from_pretrained(self.checkpoint, revision=self.pretrained_revision)

@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 
 class TurboPiPolicy(PreTrainedPolicy):
-    """A LeRobot checkpoint of type pi05, pi0 or smolvla on Turbo-Pi's fastest backend. It has no parameters of PyTorch.
+    """A LeRobot checkpoint of one of the types KINDS on Turbo-Pi's fastest backend. It has no parameters of PyTorch.
 
     turbopi   the policy that runs the model; None: made from `config`. Its robot, statistics and tokenizer aren't used
 
@@ -79,7 +79,7 @@ class TurboPiPolicy(PreTrainedPolicy):
 
     def supports_rtc(self) -> bool:
         """Whether `--inference.type=rtc` runs it: LeRobot's main branch calls this."""
-        return True
+        return self.served is not None or not _writes_tokens(self._local)
 
     def init_rtc_processor(self) -> None:
         """LeRobot calls it once `config.rtc_config` is set, before the robot is connected.
@@ -208,7 +208,9 @@ class TurboPiPolicy(PreTrainedPolicy):
         self, inputs: Observation, noise: Tensor | None, num_steps: int | None, join: Join | None, device: torch.device
     ) -> Tensor:
         shape = (inputs.batch_size, self.config.chunk_size, self.config.max_action_dim)
-        if noise is None:
+        if noise is None and _writes_tokens(self._local):  # nothing of them is drawn
+            noise = torch.zeros(shape, device=device)
+        elif noise is None:
             noise = torch.normal(mean=0.0, std=1.0, size=shape, dtype=torch.float32, device=device)
         if noise.shape != shape:
             raise ObservationError(f"noise has shape {list(noise.shape)}, but this policy needs {list(shape)}")
@@ -296,6 +298,10 @@ class TurboPiPolicy(PreTrainedPolicy):
         return state
 
 
+def _writes_tokens(policy: UnifiedPolicy) -> bool:
+    return family_of(policy.config.model).reader is not None
+
+
 class _Words:
     """A tokenizer of no model: one id for each word."""
 
@@ -311,16 +317,20 @@ def load(config: TurboPiConfig) -> UnifiedPolicy:
         )
     checkpoint = open_checkpoint(local_folder(config))
     ours = checkpoint.config
-    if family_of(ours.model).paligemma:  # the edges are those of the LeRobot that runs, and so is its time grid
-        ours = replace(ours, image_resize="lerobot").with_model(time_grid="multiplied")
+    family, tokenizer = family_of(ours.model), checkpoint.named_tokenizer
+    if family.paligemma:  # the edges are those of the LeRobot that runs, and so is its time grid
+        ours = replace(ours, image_resize="lerobot")
+    if family.paligemma and family.reader is None:
+        ours = ours.with_model(time_grid="multiplied")
     policy = UnifiedPolicy(
-        replace(checkpoint, config=ours, named_tokenizer=None),
+        replace(checkpoint, config=ours, named_tokenizer=None if family.reader is None else tokenizer),
         backend=config.backend,
         precision=cast(Any, config.precision),
         quantization=config.quantization,
         num_denoising_steps=config.num_inference_steps,
         device=config.device or "auto",
-        tokenizer=_Words(),  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
+        # LeRobot's processors tokenise; with this one warm-up alone reads a prompt, and answers are read
+        tokenizer=_Words() if family.reader is None else None,
     )
     described = policy.metadata
     logger.info(
