@@ -59,6 +59,7 @@ def test_a_token_is_the_references(policy: UnifiedPolicy, name: str) -> None:
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["quantiles_empty_camera"], indirect=True)
 @torch.no_grad()
 def test_an_end_is_marked_and_the_first_of_equals_is_chosen(policy: UnifiedPolicy, name: str) -> None:
     model = policy.backend.model  # type: ignore[attr-defined]
