@@ -6,7 +6,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from compile_for_all.targets import Target
 from turbopi.kernels.interface import SOURCE, Segments, StepEnd
@@ -22,6 +22,7 @@ from turbopi.kernels.portable import (
     quantize,
     resize,
     rope,
+    token,
     transfer,
 )
 from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
@@ -70,6 +71,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_backward(),
         *_backward_form(),
         *_smolvla(target),
+        _one_token,
     ]
     calls += [partial(_geglu, one) for one in inverses]
     return [*calls, *_weights(), *product_calls(target, numbers, chosen)]
@@ -269,6 +271,33 @@ def _smolvla(target: Target) -> Calls:
         *(partial(_layer_norm, 2048, 768, y, {}) for y in (None, *((*one, 2048, 768) for one in parts))),
         *(partial(vision, tile) for tile in attention_candidates("vision_attention", target.capability, 64)),
     ]
+
+
+def _one_token() -> None:
+    """Of Pi0-FAST: a layer behind three images and a prompt, and the head."""
+    norm, row, (heads, dim, width, hidden, places) = (
+        nn.RMSNorm(2048, dtype=BF16),
+        of(2048, dtype=F32),
+        (8, 256, 2048, 16384, 1274),
+    )
+    one, many, room = of(1, dtype=torch.int64), of(1, 256, dtype=torch.int64), of(1, dtype=torch.uint8)
+    shares = of(40, heads, dim, dtype=F32), of(40, heads, dtype=F32), of(40, heads, dtype=F32)
+    qkv, cos, cache, attended = (
+        of(2560, dtype=F32),
+        of(places, 128, dtype=F32),
+        of(1, 1, places, dim),
+        of(heads * dim, dtype=F32),
+    )
+    table, logits = of(257152, width), of(1, 257152, dtype=F32)
+    token.embed_id(one, table, row)
+    token.row_product(row, of(2560, width), qkv, norm=norm, eps=1e-6)
+    token.attend_places(qkv, (cos, cos), cache, cache, of(1, places, dtype=torch.uint8), one, one, shares)
+    token.join_shares(shares, attended)
+    token.row_product(attended, of(width, heads * dim), row, add=True)
+    token.row_product(row, of(hidden, width), of(hidden, dtype=F32), norm=norm, eps=1e-6, beside=of(hidden, width))
+    token.row_product(of(hidden, dtype=F32), of(width, hidden), row, add=True)
+    best, where = of(126, dtype=F32), of(126, dtype=torch.int32)
+    token.choose(logits, best, where, one, many, one, one, one, of(2, dtype=torch.int64), room)
 
 
 def _backward() -> Calls:

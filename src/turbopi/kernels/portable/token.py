@@ -1,20 +1,30 @@
 """One token behind a prefix: products of one row, attention of one query, and the choice of the next id.
 
 What a GPU does here is read the weights, each once. So a product's programs ask for theirs before they wait for the row
-that they multiply, and norms, GeGLU and residuals are computed beside. Sums and rows are float32, whatever the weights
-and the cache are. Twin: `Pi0FastModel.step`; engine/token.py launches them.
+that they multiply, and norms, GeGLU and residuals are computed beside. Rows and sums are float32, whatever the weights
+and the cache are. Twin of all together: `Pi0FastModel.step`, as engine/token.py launches them.
+
+Shapes: D width, H query heads, K head_dim, S places of keys and values, C shares of them.
 """
+
+import math
 
 import triton
 import triton.language as tl
+from torch import Tensor, nn
 
-from turbopi.kernels.dependent_launch import launch_dependents, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.rope import rotated
 
+PLACES = 32  # of keys and values, a program's
+LOGITS = 2048  # among which a program finds the best
+ROWS, BLOCK = 4, 2048  # of a weight, a program's at a time: 16 KB in flight are the fastest, whatever the weight's size
+_pow2 = triton.next_power_of_2
+
 
 @triton.jit
-def row_product(
+def _row_product_kernel(
     row, norm, weight, beside, out, rows, width, eps,
     NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr,
     ROWS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
@@ -52,7 +62,7 @@ def row_product(
 
 
 @triton.jit
-def attend_places(
+def _attend_places_kernel(
     qkv, cos, sin, keys, values, valid, place, position, partial, most, total, scale,
     HEADS: tl.constexpr, HALF: tl.constexpr, PLACES: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
@@ -101,7 +111,7 @@ def attend_places(
 
 
 @triton.jit
-def join_shares(
+def _join_shares_kernel(
     partial, most, total, out, shares,
     HEADS: tl.constexpr, WIDTH: tl.constexpr, SHARES: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
@@ -120,7 +130,7 @@ def join_shares(
 
 
 @triton.jit
-def best_of_share(logits, best, where, count, BLOCK: tl.constexpr, PDL: tl.constexpr):
+def _best_of_share_kernel(logits, best, where, count, BLOCK: tl.constexpr, PDL: tl.constexpr):
     """The largest of BLOCK logits, and the first id that has it; NaN is the largest, as in PyTorch."""
     share = tl.program_id(0)
     at = share * BLOCK + tl.arange(0, BLOCK)
@@ -134,7 +144,7 @@ def best_of_share(logits, best, where, count, BLOCK: tl.constexpr, PDL: tl.const
 
 
 @triton.jit
-def choose(
+def _choose_kernel(
     best, where, chosen, ids, written, place, position, ends, ended, shares, num_ends,
     SHARES: tl.constexpr, ENDS: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
@@ -156,7 +166,7 @@ def choose(
 
 
 @triton.jit
-def embed_id(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
+def _embed_id_kernel(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
     """The id's row of the table times `scale`, rounded as the table is."""
     k = tl.arange(0, BLOCK)
     wait_for_producer(PDL)
@@ -164,3 +174,73 @@ def embed_id(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.cons
     number = tl.load(table + tl.load(chosen) * width + k, k < width, 0.0)
     scaled = (number.to(tl.float32) * scale).to(table.dtype.element_ty)
     tl.store(out + k, scaled.to(tl.float32), k < width)
+
+
+def row_product(
+    row: Tensor, weight: Tensor, out: Tensor, *, norm: nn.Module | None = None, eps: float = 0.0,
+    beside: Tensor | None = None, add: bool = False,
+) -> None:  # fmt: skip
+    """weight [N, D] times row float32[D] -> out float32[N]; `norm`'s weight: of the RMSNorm that comes first.
+
+    beside  [N, D]: out is gelu(weight · row) times (beside · row)
+    add     to what `out` holds
+    """
+    rows, width = weight.shape
+    whole, other = _pow2(width), weight if beside is None else beside
+    _row_product_kernel[(triton.cdiv(rows, ROWS),)](
+        row, row if norm is None else norm.get_parameter("weight"), weight, other, out, rows, width, eps,
+        NORM=norm is not None, GATED=beside is not None, ADD=add,
+        ROWS=ROWS, BLOCK=whole if norm is not None else min(BLOCK, whole), num_warps=4, **dependent_launch(row),
+    )  # fmt: skip
+
+
+def attend_places(
+    qkv: Tensor, rope: tuple[Tensor, Tensor], keys: Tensor, values: Tensor, valid: Tensor, place: Tensor,
+    position: Tensor, shares: tuple[Tensor, Tensor, Tensor],
+) -> None:  # fmt: skip
+    """Put this token's key and value at `place`, and attend to it and to the valid places before, by shares.
+
+    qkv       float32[(H + 2) * K], not rotated
+    rope      cos and sin, float32[positions, K/2]
+    keys, values  [1, 1, S, K]; valid uint8[1, S]; place, position int64[1]
+    shares    what `join_shares` reads: float32 [C, H, K], [C, H], [C, H]
+    """
+    partial, most, total = shares
+    count, heads, dim = partial.shape
+    _attend_places_kernel[count, heads](
+        qkv, *rope, keys, values, valid, place, position, partial, most, total, dim**-0.5,
+        HEADS=heads, HALF=dim // 2, PLACES=PLACES, **dependent_launch(qkv),
+    )  # fmt: skip
+
+
+def join_shares(shares: tuple[Tensor, Tensor, Tensor], out: Tensor) -> None:
+    """What `attend_places` left, to out float32[H * K]."""
+    partial, most, total = shares
+    count, heads, dim = partial.shape
+    _join_shares_kernel[(heads,)](
+        partial, most, total, out, count,
+        HEADS=heads, WIDTH=dim, SHARES=_pow2(count), num_warps=8, **dependent_launch(out),
+    )  # fmt: skip
+
+
+def choose(
+    logits: Tensor, best: Tensor, where: Tensor, chosen: Tensor, ids: Tensor, count: Tensor, place: Tensor,
+    position: Tensor, ends: Tensor, ended: Tensor,
+) -> None:  # fmt: skip
+    """The first of the largest logits float32[1, V], written down as `Decoding` says, and the counters moved on.
+
+    best, where  float32 and int32, of one in LOGITS logits each: room
+    ended        uint8[1]
+    """
+    shares, of_all = len(best), logits.shape[1]
+    _best_of_share_kernel[(shares,)](logits, best, where, of_all, BLOCK=LOGITS, **dependent_launch(logits))
+    _choose_kernel[(1,)](
+        best, where, chosen, ids, count, place, position, ends, ended, shares, len(ends),
+        SHARES=_pow2(shares), ENDS=_pow2(max(1, len(ends))), **dependent_launch(logits),
+    )  # fmt: skip
+
+
+def embed_id(chosen: Tensor, table: Tensor, out: Tensor) -> None:
+    """The row int64[1] of table [V, D] times √D, rounded as the table is, to out float32[D]."""
+    width = table.shape[1]
+    _embed_id_kernel[(1,)](chosen, table, out, width, math.sqrt(width), BLOCK=_pow2(width), **dependent_launch(out))
