@@ -82,6 +82,7 @@ def main() -> None:
                 control_hz=options.hz,
                 execution=options.execution,
                 hold_action=HOLD,
+                hold_on=("camera_black", "camera_frozen", "camera_exchanged", "camera_channels", "camera_turned"),
                 max_observation_age_s=options.age,
             ) as executor,
             contextlib.suppress(KeyboardInterrupt),

@@ -96,7 +96,7 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
     If it doesn't fit the checkpoint, ConfigError is raised for --robot's; of the configuration's a note says why.
     """
     from turbopi.robots.base import described
-    from turbopi.robots.labels import action_labels, state_labels
+    from turbopi.robots.labels import action_labels, camera_label, state_labels
 
     opened = options.open(checkpoint)
     try:
@@ -113,6 +113,7 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
     return {
         **{key: about[key] for key in ("robot", "robot_state_dim", "robot_action_dim", "default_prompt")},
         "observation": described(pipeline.example()),
+        "cameras": {camera_label(pipeline.robot, one): one for one in pipeline.see(pipeline.example()).cameras},
         "labels": {feature: [one._asdict() for one in some] for feature, some in labels.items()},
         "notes": [*notes, *pipeline.notes],
     }
@@ -124,6 +125,12 @@ def robot_pipeline(checkpoint: "Checkpoint", robot: Any, default_prompt: str | N
 
     no_tokenizer: Any = None  # nothing is tokenised
     return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, default_prompt, robot)
+
+
+def _told(info: dict[str, Any], key: str, kind: str) -> str:
+    """What is sent under a robot's key; of an image also which of the model's cameras it is."""
+    camera = info["cameras"].get(key, key)
+    return kind if camera == key else f"{kind}, the model's {camera}"
 
 
 def _show(info: dict[str, Any], output: Output) -> None:
@@ -161,7 +168,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         facts += [
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
-            *((f"  its {key}", value) for key, value in info.get("observation", {}).items()),
+            *((f"  its {key}", _told(info, key, value)) for key, value in info.get("observation", {}).items()),
             ("action horizon", f"{info['action_horizon']}, {_made_in(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             *([] if info["memory"] is None else [("memory", _memory(info["memory"]))]),

@@ -26,6 +26,7 @@ from turbopi.replay.episodes import Dataset, Selection
 from turbopi.replay.judge import judge
 from turbopi.replay.page import Material, write_report
 from turbopi.replay.run import Replay, Replayed, Settings
+from turbopi.support.action_groups import names_of as names_in
 from turbopi.support.errors import ConfigError
 from turbopi.support.provenance import provenance
 from turbopi.support.text import significant
@@ -134,9 +135,10 @@ class Report:
         )
 
     def _state_names(self) -> tuple[str, ...] | None:
-        keys = self._compared[0].run.keys
+        about, keys = self._compared[0].run.about, self._compared[0].run.keys
         numbers = [source for key, source in keys.joined.items() if key not in keys.cameras]
-        return self._dataset.names_of(numbers[0]) if len(numbers) == 1 else None
+        of_data = self._dataset.names_of(numbers[0]) if len(numbers) == 1 else None
+        return tuple(names_in(about, "state") or ()) if of_data is None else of_data
 
     def _prompt(self, observation: Mapping[str, Any]) -> str:
         about = self._compared[0].run.about

@@ -46,7 +46,8 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
             print_line(f"warm-up: {time.perf_counter() - began:.1f} s")
         first, *others = [f"ws://{name}:{server.port}" for name in addresses(server.host)] or [server.url]
         http = escape(first.replace("ws://", "http://"))
-        print_line(f"Serving at [bold]{escape(first)}[/]   health {http}/healthz   metrics {http}/metrics")
+        print_line(f"Serving at [bold]{escape(first)}[/]")
+        print_line(f"Health {http}/healthz, metrics {http}/metrics")
         if server.options.has_page:
             print_line(f"Page {http}/")
         if others:
