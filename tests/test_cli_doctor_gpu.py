@@ -10,7 +10,7 @@ import torch
 from tile_helpers import tile_document
 
 from turbopi import backends
-from turbopi.backends import Precision, tuned_tiles
+from turbopi.backends import Precision, qualification, tuned_tiles
 from turbopi.bench.measured import measured_calls
 from turbopi.cli import gpu_checkups
 from turbopi.cli.checkup import Row
@@ -57,6 +57,9 @@ def fake(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Fake:
         monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: properties)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
         monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: code)
+        monkeypatch.setattr(qualification, "KNOWN", ("NVIDIA Fake",) if capability == (9, 0) else ())
+        monkeypatch.setattr(qualification, "cache_folder", lambda: cache)
+        monkeypatch.setattr(qualification, "_driver", lambda: driver)
         monkeypatch.setattr(torch.version, "cuda", cuda)
         monkeypatch.setattr(gpu_checkups, "nvidia_smi", lambda: (driver, ["NVIDIA Fake"]))
         monkeypatch.setattr(gpu_checkups, "ptxas_version", lambda arch: ptxas)
@@ -111,7 +114,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
             assert row == Row("OK", row.name, f"doesn't run: {refused}")
         else:
             assert row.level == "OK" and row.found.startswith(f"{chosen}: ")
-            assert ("never run on compute capability" in row.found) == (capability != (9, 0))
+            assert ("isn't qualified on this GPU" in row.found) == (capability != (9, 0))
             took = measured_gb(chosen, precision)
             assert took is None or f"takes {took + gpu_checkups.CONTEXT_GB:.1f} GB" in row.found
 
@@ -119,7 +122,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
 def test_every_tier_but_the_small_ones_has_a_row(fake: Fake) -> None:
     fake((9, 0))
     reported = {name.removeprefix("GPU 0 ") for name in rows() if name.startswith("GPU 0 ")}
-    assert reported == {"tiles", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
+    assert reported == {"tiles", "known", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
 
 
 @pytest.mark.parametrize(

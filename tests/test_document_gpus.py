@@ -1,6 +1,7 @@
 """docs/gpus.md says of each GPU what the backends, the checked-in results and the predictions say."""
 
 import json
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from compile_for_all.document import Compiled, CompiledForAll, written
 from doc_tables import gpus as tables
 
 from turbopi import backends
+from turbopi.backends import qualification
 from turbopi.bench.gpus import find_gpu, published_gpus
 from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import predict
@@ -40,6 +42,9 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
     gpu = find_gpu(key)
     row = cells(table(), gpu.name)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: gpu.capability)
+    named = [name for name in qualification.KNOWN if re.search(rf"\b{gpu.key}\b", name.lower())]
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: (*named, gpu.name)[0])
+    monkeypatch.setattr(qualification, "kept", lambda device, precision, model: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: object())
     monkeypatch.setattr("shutil.which", lambda name, *rest: f"/usr/bin/{name}")
     monkeypatch.setattr("turbopi.support.toolchain._missing_headers", lambda: None)
@@ -54,7 +59,7 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
             assert any(line.rstrip(" |").split("| ")[-1] in said for line in reasons)
         else:
             backends.check(chosen, device, precision)
-            assert row[precision] == f"`{chosen}`"
+            assert row[precision] == f"`{chosen}`" + tables.QUALIFIED * (not named)
 
 
 def test_every_gpu_asked_for_has_its_rows() -> None:

@@ -1,0 +1,345 @@
+"""The stages of qualifying, each of which raises `Faulty` for what isn't right."""
+
+import gc
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbopi import backends
+from turbopi.backends.base import Sample
+from turbopi.backends.qualification import DENOISE
+from turbopi.bench.measure import WARMING, Observations, bench_policy, call
+from turbopi.bench.work import Job
+from turbopi.calibrate.run import Progress, Settings, calibrate
+from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.checkpoint.random_weights import random_checkpoint
+from turbopi.config import Network, Normalization, PolicyConfig, VisionConfig
+from turbopi.engine.graph import empty_cache, preparing
+from turbopi.kernels.grid_barrier import barrier_us, check_barrier
+from turbopi.kernels.ops import hopper_kernels
+from turbopi.models import RANDOM
+from turbopi.models.observation import ModelInputs, Observation
+from turbopi.policy import shipped
+from turbopi.policy.policy import UnifiedPolicy
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import tokenizer_of
+from turbopi.qualify.operations import COMPILING, RUNNING, At, Comparison
+from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, shapes_of
+from turbopi.quantization.plan import TIERS, Precision, format_of
+from turbopi.quantization.sites import Site, sites
+from turbopi.support.errors import BackendUnavailable
+from turbopi.support.text import significant
+from turbopi.tune.race import busy, in_turns, timed, winner
+from turbopi.verify.check_golden import GOLDEN_METHODS
+from turbopi.verify.document import Certificate
+from turbopi.verify.inputs import VerifyPlan
+from turbopi.verify.run import verify
+
+LAYERS = 4  # of the model's: more than vision's head, which a graph of its own runs
+OBSERVATIONS, NOISES = 4, 2
+BATCH = 2
+# Of a batch's actions against single calls', relative rms: either rounds by itself, to 0.02 with such weights
+BATCH_BOUND, EIGHT_BITS_BATCH_BOUND = 0.06, 0.12
+MARGIN = 0.01  # of the time of `cuda_graph`: less is noise
+ROUNDS = 21
+Figures = dict[str, float]  # by what they are of
+OF_DENOISING = ("x_t", "v_t", "actions")
+
+
+class Faulty(Exception):
+    """Something isn't right. path: what of `fused` to exclude for it, "" for all."""
+
+    def __init__(self, why: str, path: str = "") -> None:
+        super().__init__(why)
+        self.path = path
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is qualified. excluded: so far. rival: what `auto` takes in its place; None: nothing has the precision."""
+
+    model: Network
+    precision: Precision
+    device: torch.device
+    at: At
+    excluded: dict[str, str]
+    name: str = "fused"
+    rival: str | None = "cuda_graph"
+
+    def policy_config(self, model: Network) -> PolicyConfig:
+        """As `turbopi bench` has it: nothing but the model."""
+        base = next(one for one in RANDOM.values() if type(one.model) is type(model) and one.model.kind == model.kind)
+        identity = Normalization("identity", "identity")
+        plain = replace(base, name="qualified", model=model, robot="plain", robot_options={}, normalization=identity)
+        return replace(plain, discrete_state_input=False, missing_cameras="masked", asset_id=None)
+
+    def quantization(self, checkpoint: Checkpoint) -> Quantization | None:
+        """A calibration on a few observations."""
+        if self.precision not in TIERS:
+            return None
+        self.at("calibrating", "", COMPILING)
+        format, source = format_of(self.precision), RANDOM_NOISE if checkpoint.path is None else None
+        settings = Settings(
+            {"device": self.device},
+            source,
+            count=OBSERVATIONS,
+            methods=GOLDEN_METHODS[format.name],
+            format=format,
+        )
+        return calibrate(checkpoint, settings)
+
+    @property
+    def progress(self) -> Progress:
+        return Progress(lambda text, total: self.at(text, "", COMPILING), lambda: self.at("", "", 0.0))
+
+
+def stretched(quantization: Quantization | None, shallow: Any, model: Any) -> Quantization | None:
+    """Of all layers, from those of the shallow model: the last ones are alike, and so are all others."""
+    if quantization is None:
+        return None
+
+    def origin(site: Site) -> str:
+        part = "vlm" if site.part == "prefix" else site.part
+        deep, few = getattr(model, part).depth, getattr(shallow, part).depth
+        layer = few - 1 if site.layer + 1 == deep else min(site.layer, max(few - 2, 0))
+        return str(replace(site, layer=layer))
+
+    found = {str(site): quantization.sites[origin(site)] for site in sites(model)}
+    return replace(quantization, shapes=shapes_of(model), sites=found)
+
+
+def shallow(config: Any) -> Any:
+    """The same sizes with at most LAYERS layers in each stack."""
+    deepest = max(_depths(config))
+
+    def cut(part: Any) -> Any:
+        if isinstance(part, VisionConfig):
+            return replace(part, depth=min(part.depth, LAYERS))
+        changes: dict[str, Any] = {}
+        for one in fields(part):
+            value = getattr(part, one.name)
+            if is_dataclass(value):
+                changes[one.name] = cut(value)
+            elif one.name.endswith("depth") and deepest > LAYERS:
+                changes[one.name] = max(1, value * LAYERS // deepest)
+        return replace(part, **changes)
+
+    return cut(config)
+
+
+def _depths(part: Any) -> Iterator[int]:
+    for one in fields(part):
+        value = getattr(part, one.name)
+        if is_dataclass(value) and not isinstance(value, VisionConfig):
+            yield from _depths(value)
+        elif one.name.endswith("depth"):
+            yield value
+
+
+# -- the grid's barrier, each kernel -----------------------------------------------------------------------------------
+
+
+def check_grid(subject: Subject) -> Figures:
+    """The barrier's cost. The denoising kernel alone has one."""
+    if DENOISE in subject.excluded:
+        return {}
+    subject.at("the grid's barrier", DENOISE, RUNNING)
+    try:
+        why = check_barrier(subject.device)
+    except BackendUnavailable as failure:
+        why = str(failure)
+    if why is not None:
+        raise Faulty(f"the grid's barrier doesn't hold: {why}", DENOISE)
+    return {"barrier us": round(barrier_us(subject.device) or 0.0, 3)}
+
+
+def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quantization | None) -> Comparison:
+    """Every operation of a call beside PyTorch's, then a batch beside its single calls."""
+    cls, compared = backends.class_for(subject.name, subject.model), Comparison(subject.device, subject.at)
+
+    class Compared(cls):  # type: ignore[valid-type, misc]
+        def _make_ops(self) -> Any:
+            return compared.around(super()._make_ops())
+
+        def _make_denoiser(self, *given: Any, **named: Any) -> Any:
+            return compared.denoiser(super()._make_denoiser, *given, **named)
+
+    with preparing(subject.device):
+        backend: Any = Compared(
+            checkpoint.config.model,
+            lambda to, mode: checkpoint.load(to, mode).state,
+            device=subject.device,
+            precision=subject.precision,
+            quantization=quantization,
+        )
+    steps, model = checkpoint.config.num_denoising_steps, checkpoint.config.model
+    inputs = [filled(checkpoint, seed) for seed in range(BATCH)]
+    noise = torch.from_numpy(
+        np.random.default_rng(0).standard_normal((BATCH, model.action_horizon, model.action_dim), dtype=np.float32)
+    )
+    alone = [backend.sample(Observation.stack([one]), noise[i : i + 1], steps) for i, one in enumerate(inputs)]
+    if cls.runs_batches and not compared.failed and "batch" not in subject.excluded:
+        subject.at("a batch of two", "batch", COMPILING)
+        together = backend.sample(Observation.stack(inputs), noise, steps)
+        _check_batch(together, alone, EIGHT_BITS_BATCH_BOUND if subject.precision in TIERS else BATCH_BOUND)
+    subject.at("kernels", "", COMPILING)
+    return compared
+
+
+def _check_batch(together: Sample, alone: list[Sample], bound: float) -> None:
+    exact = torch.cat([one.actions for one in alone]).float()
+    error = float((together.actions.float() - exact).norm() / exact.norm())
+    if not error <= bound:
+        raise Faulty(f"a batch's actions are off by {significant(error)}; at most {bound} is right", "batch")
+
+
+def filled(checkpoint: Checkpoint, seed: int) -> ModelInputs:
+    """An observation of random images whose prompt fills whole tiles: no row is padding, which may be anything."""
+    config = checkpoint.config
+    pipeline = Pipeline(config, checkpoint.norm_stats, tokenizer_of(checkpoint, None))
+    inputs = pipeline.complete(pipeline.see(pipeline.example(seed)))
+    count, longest = len(inputs.tokens) // 16 * 16 or len(inputs.tokens), len(inputs.tokens)
+    tokens = np.random.default_rng(seed).integers(1, config.model.vocab_size, longest)
+    valid = np.arange(longest) < count
+    return replace(inputs, tokens=np.where(valid, tokens, 0), token_mask=valid)
+
+
+# -- stages against float32 --------------------------------------------------------------------------------------------
+
+
+def certify(subject: Subject, checkpoint: Checkpoint, quantization: Quantization | None) -> Figures:
+    """The worst error of each stage over what is allowed there (`turbopi verify`)."""
+    arguments = {
+        "backend": subject.name,
+        "precision": subject.precision,
+        "device": subject.device,
+        "quantization": quantization,
+    }
+    plan = VerifyPlan(arguments, count=OBSERVATIONS, noises=NOISES, fingerprint=False)
+    certificate = verify(checkpoint, plan, subject.progress)
+    judge(certificate, subject)
+    worst = {"prefix": 0.0, "denoise": 0.0}
+    for one in certificate.intermediates:
+        if one.allowed and one.name != "actions":
+            stage = "denoise" if one.name in OF_DENOISING else "prefix"
+            worst[stage] = max(worst[stage], one.badness)
+    limit, error = certificate.bounds.actions_relative_rms, certificate.actions.relative_rms
+    figures = {f"{stage}, error over bound": round(value, 3) for stage, value in worst.items()}
+    return figures | {"actions, error over bound": round((error or 0.0) / (limit or 1.0), 3)}
+
+
+def judge(certificate: Certificate, subject: Subject) -> None:
+    """Raise Faulty, by the first stage that is off."""
+    off = [one for one in certificate.intermediates if one.above or not one.finite]
+    if certificate.ok and not off:
+        return
+    why = certificate.verdict if not certificate.ok else f"{off[0].name} is off by {significant(off[0].relative_rms)}"
+    path = DENOISE
+    if any(one.name not in OF_DENOISING for one in off):
+        path = "sm90" if hopper_kernels(subject.device, subject.excluded) else ""
+    raise Faulty(why, "" if path in subject.excluded else path)
+
+
+def golden(subject: Subject) -> Checkpoint | None:
+    """The small policy that ships, if the backend runs it by the same class as the model."""
+    checkpoint = open_checkpoint(shipped.SMALL_POLICY)
+    same = backends.class_for(subject.name, checkpoint.config.model) is backends.class_for(subject.name, subject.model)
+    return checkpoint if same else None
+
+
+# -- the race ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Raced:
+    """milliseconds by backend and stage, medians; memory: bytes that the subject reserved; wins: whether it is the
+    faster one; note: what makes the times doubtful.
+    """
+
+    milliseconds: dict[str, dict[str, float]]
+    memory: int
+    wins: bool
+    note: str
+
+
+def race(subject: Subject, quantization: Quantization | None) -> Raced:
+    """Calls of the whole model with random weights, of both in turns where the memory is enough for both."""
+    config = subject.policy_config(subject.model)
+    checkpoint = random_checkpoint(config)
+    longest = subject.model.max_prompt_tokens
+    job = Job(2, min(48, longest), subject.model.action_horizon, config.num_denoising_steps)
+
+    def entrant(name: str) -> _Entrant:
+        subject.at(f"{name} at full size", "", COMPILING)
+        given: Any = quantization
+        return _Entrant(bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given), job)
+
+    ours = entrant(subject.name)
+    memory = _reserved(subject.device)
+    if subject.rival is None:
+        in_turns({0: ours.once}, ROUNDS)
+        return Raced({subject.name: ours.medians}, memory, True, "")
+    notes = []
+    try:
+        theirs = entrant(subject.rival)
+        in_turns({0: theirs.once, 1: ours.once}, ROUNDS)
+    except torch.OutOfMemoryError:
+        notes.append("one after the other, as the memory isn't enough for both")
+        in_turns({0: ours.once}, ROUNDS)
+        ours.release()
+        _free(subject.device)
+        theirs = entrant(subject.rival)
+        in_turns({0: theirs.once}, ROUNDS)
+    rows = {0: timed({}, theirs.totals), 1: timed({}, ours.totals)}
+    if busy(row.spread for row in rows.values()):
+        notes.append("times varied by more than 15 %: was the GPU used by others?")
+    return Raced(
+        {subject.name: ours.medians, subject.rival: theirs.medians},
+        memory,
+        winner(rows, MARGIN) is rows[1],
+        "; ".join(notes),
+    )
+
+
+class _Entrant:
+    """A warm policy and the times of its calls."""
+
+    def __init__(self, policy: UnifiedPolicy, job: Job) -> None:
+        self._policy: UnifiedPolicy | None = policy
+        self._job, self._observations = job, Observations(policy, job)
+        self._timings: dict[str, list[float]] = {}
+        for _ in range(WARMING):
+            call(policy, job, self._observations)
+
+    def once(self) -> float:
+        """Milliseconds of a call."""
+        assert self._policy is not None
+        timing = call(self._policy, self._job, self._observations)
+        for name in ("total", "vision", "prefix", "denoise"):
+            if f"{name}_ms" in timing:
+                self._timings.setdefault(name, []).append(timing[f"{name}_ms"])
+        return timing["total_ms"]
+
+    @property
+    def totals(self) -> list[float]:
+        return self._timings["total"][-ROUNDS:]
+
+    @property
+    def medians(self) -> dict[str, float]:
+        return {name: round(float(np.median(times[-ROUNDS:])), 3) for name, times in self._timings.items()}
+
+    def release(self) -> None:
+        self._policy = None
+
+
+def _reserved(device: torch.device) -> int:
+    return torch.cuda.max_memory_reserved(device) if device.type == "cuda" else 0
+
+
+def _free(device: torch.device) -> None:
+    gc.collect()
+    if device.type == "cuda":
+        empty_cache()
