@@ -160,8 +160,7 @@ def test_time_is_up_at_most_twice_and_then_doctor_is_named(
     child: Child, started: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     child('say(at="cuda_graph at full size", quiet=99.0)\nhang()')
-    patient = qualify
-    monkeypatch.setattr(backends, "qualify", lambda *given, **named: patient(*given, **named, seconds=0.5))
+    monkeypatch.setattr(qualification, "SECONDS", 0.5)
     assert [chosen() for _ in range(4)] == ["cuda_graph"] * 4 and len(starts(started)) == qualification.TURNS
     why = backends.choose(GPU, "bf16", MODEL)[1]
     assert "time was up at cuda_graph at full size; `turbopi doctor --qualify` takes up to 600 s" in why

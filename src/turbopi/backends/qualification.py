@@ -235,10 +235,18 @@ def _kernels_hash() -> str:
 
 
 def qualify(
-    device: torch.device, precision: Precision, model: Network, *, seconds: float = SECONDS, tell: Tell | None = None
+    device: torch.device,
+    precision: Precision,
+    model: Network,
+    *,
+    seconds: float | None = None,
+    tell: Tell | None = None,
 ) -> Verdict:
-    """Find out, in at most so many seconds, and keep the verdict. Processes that want the same take turns."""
-    file, end = file_of(device, precision, model), time.monotonic() + seconds
+    """Find out, in at most so many seconds (None: SECONDS), and keep the verdict. Processes that want the same take
+    turns.
+    """
+    file = file_of(device, precision, model)
+    end = time.monotonic() + (SECONDS if seconds is None else seconds)
     before = kept(device, precision, model)
     tell = tell or (lambda text, done: None)
     while True:

@@ -80,6 +80,8 @@ class Comparison:
             self._wait()
             error, bound = _difference((result, *given, *named.values()), (exact, *before, *named_before.values()))
             why = wrong(error, bound)
+        except torch.OutOfMemoryError:
+            raise
         except Exception as failure:  # that it doesn't run is a result
             self._guard.examine(failure)
             why, error = first_line(failure), float("inf")

@@ -277,6 +277,7 @@ def race(subject: Subject, quantization: Quantization | None) -> Raced:
         given: Any = quantization
         return _Entrant(bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given), job)
 
+    _free(subject.device)
     ours = entrant(subject.name)
     memory = _reserved(subject.device)
     if subject.rival is None:
@@ -340,6 +341,8 @@ def _reserved(device: torch.device) -> int:
 
 
 def _free(device: torch.device) -> None:
+    """What nobody holds any more, and what was reserved at most so far."""
     gc.collect()
     if device.type == "cuda":
         empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
