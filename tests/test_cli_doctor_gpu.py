@@ -149,7 +149,7 @@ def test_a_missing_compiler_comes_with_its_command(fake: Fake, monkeypatch: pyte
 
 def qualify(monkeypatch: pytest.MonkeyPatch, found: Verdict, *options: str) -> tuple[int, dict[str, Any]]:
     """Exit code and JSON of `turbopi doctor --qualify` where the process finds that."""
-    monkeypatch.setattr(gpu_checkups, "check_gpu", list)
+    monkeypatch.setattr("turbopi.cli.checkups.check_gpu", list)
     monkeypatch.setattr(backends, "refusal", lambda *given: None)
     monkeypatch.setattr(backends, "resolve_device", lambda device: torch.device("cuda", 0))
     monkeypatch.setattr(doctor, "list_backends", lambda device, precision: {})
@@ -179,7 +179,7 @@ def test_doctor_says_what_to_do_about_a_fault(fake: Fake, monkeypatch: pytest.Mo
     assert row.level == "WARN" and row.fix.endswith(
         f"attach the file that `turbopi doctor --qualify` wrote: {document['file']}"
     )
-    assert refusal("doctor", "--force") == "--force goes with --qualify"
+    assert refusal(turbopi("doctor", "--force")) == "--force goes with --qualify"
 
 
 def test_a_known_gpu_is_said_to_be_one(fake: Fake) -> None:

@@ -4,8 +4,10 @@ The GPU's answers are stand-ins; tests/test_gpu_qualify.py has the same faults o
 """
 
 import dataclasses
+import weakref
 from collections.abc import Callable
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -242,70 +244,70 @@ def test_what_ends_it_is_said(
 # -- the race ----------------------------------------------------------------------------------------------------------
 
 
-class Entrant:
-    """Calls of a fixed time, of which every other one takes so much longer."""
+@dataclasses.dataclass(eq=False)
+class Policy:
+    name: str
 
-    milliseconds: ClassVar[dict[str, float]] = {}
-    jitter = 0.0
-    room = 2  # how many the memory holds
-    alive = 0
 
-    def __init__(self, name: str, job: object) -> None:
-        if Entrant.alive >= Entrant.room:
+class Policies:
+    """In place of policies: calls of a fixed time, and as many policies as the memory holds."""
+
+    def __init__(self) -> None:
+        self.milliseconds = {"fused": 20.0, "cuda_graph": 30.0}
+        self.room, self.jitter = 2, 0.0
+        self._alive = 0
+        self._turn = 0
+
+    def make(self, checkpoint: object, name: str, *given: object, **named: object) -> object:
+        if self._alive >= self.room:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        Entrant.alive += 1
-        self._name, self.totals = name, list[float]()
+        self._alive += 1
+        made = Policy(name)
+        weakref.finalize(made, self._closed)
+        return made
 
-    def once(self) -> float:
-        self.totals.append(self.milliseconds[self._name] * (1 + self.jitter * (len(self.totals) % 2)))
-        return self.totals[-1]
+    def _closed(self) -> None:
+        self._alive -= 1
 
-    @property
-    def medians(self) -> dict[str, float]:
-        return {"total": sorted(self.totals)[len(self.totals) // 2]}
-
-    def release(self) -> None:
-        Entrant.alive -= 1
+    def measure(self, policy: Any, job: object, calls: int) -> dict[str, Any]:
+        self._turn += 1
+        slower = 1 + self.jitter * (self._turn % 2)
+        return {"total": SimpleNamespace(median=self.milliseconds[policy.name] * slower)}
 
 
 @pytest.fixture
-def entrants(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Entrant, "alive", 0)
-    monkeypatch.setattr(Entrant, "milliseconds", {"fused": 20.0, "cuda_graph": 30.0})
-    monkeypatch.setattr(stages, "_Entrant", Entrant)
-    monkeypatch.setattr(stages, "bench_policy", lambda checkpoint, name, *given, **named: name)
+def policies(monkeypatch: pytest.MonkeyPatch) -> Policies:
+    made = Policies()
+    monkeypatch.setattr(stages, "bench_policy", made.make)
+    monkeypatch.setattr(stages, "measure_calls", made.measure)
+    return made
 
 
 RACING = Subject(SIX_LAYERS, "bf16", CPU, lambda *event: None, {})
 
 
 @pytest.mark.parametrize(("ours", "wins"), [(20.0, True), (29.9, False), (31.0, False)])
-@pytest.mark.usefixtures("entrants")
-def test_what_is_faster_by_more_than_noise_wins(ours: float, wins: bool) -> None:
-    Entrant.milliseconds["fused"] = ours
+def test_what_is_faster_by_more_than_noise_wins(ours: float, wins: bool, policies: Policies) -> None:
+    policies.milliseconds["fused"] = ours
     raced = race(RACING, None)
     assert raced.wins == wins and raced.note == ""
     assert raced.milliseconds == {"fused": {"total": ours}, "cuda_graph": {"total": 30.0}}
 
 
-@pytest.mark.usefixtures("entrants")
-def test_a_clock_that_varies_is_said_and_hits_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Entrant, "jitter", 1.0)
-    raced = race(RACING, None)
-    assert raced.wins and raced.note == "times varied by more than 15 %: was the GPU used by others?"
+def test_a_clock_that_varies_is_said_and_hits_both(policies: Policies) -> None:
+    policies.jitter = 1.0
+    assert race(RACING, None).note == "times varied by more than 15 %: was the GPU used by others?"
 
 
-@pytest.mark.usefixtures("entrants")
-def test_without_memory_for_both_they_run_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Entrant, "room", 1)
+def test_without_memory_for_both_they_run_one_after_the_other(policies: Policies) -> None:
+    policies.room = 1
     raced = race(RACING, None)
     assert raced.wins and raced.note == "one after the other, as the memory isn't enough for both"
-    monkeypatch.setattr(Entrant, "room", 0)
+    policies.room = 0
     with pytest.raises(torch.OutOfMemoryError):
         race(RACING, None)
 
 
-@pytest.mark.usefixtures("entrants")
-def test_where_nothing_else_has_the_precision_it_is_timed_alone() -> None:
+def test_where_nothing_else_has_the_precision_it_is_timed_alone(policies: Policies) -> None:
     raced = race(dataclasses.replace(RACING, rival=None), None)
-    assert raced.wins and set(raced.milliseconds) == {"fused"}
+    assert raced.wins and set(raced.milliseconds) == {"fused"} and raced.note == ""

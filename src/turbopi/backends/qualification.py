@@ -32,7 +32,7 @@ from msgspec import Struct
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from turbopi.backends.tuned_tiles import PACKAGE, Machine
+from turbopi.backends.tuned_tiles import PACKAGE
 from turbopi.config import Kind, Network
 from turbopi.kernels.ops import forced_portable
 from turbopi.quantization.plan import TIERS, Precision
@@ -185,19 +185,20 @@ _UNKEPT: dict[Path, Verdict] = {}  # which hold in this process alone: no cache,
 
 def file_of(device: torch.device, precision: Precision, model: Network) -> Path:
     """Of a GPU with its driver, versions and kernels, of a model's sizes and a precision."""
-    about = _about(Machine.of(device), device, precision, model)
+    about = _about(device, precision, model)
     decisive = json.dumps({name: one for name, one in about.items() if name != "date"}, sort_keys=True)
     slug = re.sub(r"[^a-z0-9]+", "-", f"{about['gpu']} {about['model']} {precision}".lower()).strip("-")
     return cache_folder() / "qualified" / f"{slug}-{hashlib.sha256(decisive.encode()).hexdigest()[:12]}.json"
 
 
-def _about(machine: Machine, device: torch.device, precision: Precision, model: Network) -> dict[str, Any]:
-    on_hopper = machine.capability == (9, 0) and not forced_portable()
+def _about(device: torch.device, precision: Precision, model: Network) -> dict[str, Any]:
+    gpu = torch.cuda.get_device_properties(device)
+    on_hopper = (gpu.major, gpu.minor) == (9, 0) and not forced_portable()
     return {
-        "gpu": machine.gpu,
-        "compute_capability": machine.compute_capability,
-        "multiprocessors": machine.multiprocessors,
-        "memory_bytes": torch.cuda.get_device_properties(device).total_memory,
+        "gpu": gpu.name,
+        "compute_capability": f"{gpu.major}.{gpu.minor}",
+        "multiprocessors": gpu.multi_processor_count,
+        "memory_bytes": gpu.total_memory,
         "driver": _driver(),
         "versions": dict(_versions()),
         "kernels": "hopper" if on_hopper else "portable",
@@ -329,7 +330,7 @@ def _verdict(
     elif not run.finished:
         taken = "fused" if alone else "cuda_graph"
     return Verdict(
-        **_about(Machine.of(device), device, precision, model),
+        **_about(device, precision, model),
         seconds=round(seconds, 1),
         taken=taken,
         reason=reason,

@@ -2,8 +2,9 @@
 
 import gc
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ import torch
 from turbopi import backends
 from turbopi.backends.base import Sample
 from turbopi.backends.qualification import DENOISE
-from turbopi.bench.measure import WARMING, Observations, bench_policy, call
+from turbopi.bench.measure import bench_policy, measure_calls
 from turbopi.bench.work import Job
 from turbopi.calibrate.run import Progress, Settings, calibrate
 from turbopi.checkpoint import Checkpoint, open_checkpoint
@@ -32,7 +33,7 @@ from turbopi.quantization.plan import TIERS, Precision, format_of
 from turbopi.quantization.sites import Site, sites
 from turbopi.support.errors import BackendUnavailable
 from turbopi.support.text import significant
-from turbopi.tune.race import busy, in_turns, timed, winner
+from turbopi.tune.race import busy, timed, winner
 from turbopi.verify.check_golden import GOLDEN_METHODS
 from turbopi.verify.document import Certificate
 from turbopi.verify.inputs import VerifyPlan
@@ -44,7 +45,8 @@ BATCH = 2
 # Of a batch's actions against single calls', relative rms: either rounds by itself, to 0.02 with such weights
 BATCH_BOUND, EIGHT_BITS_BATCH_BOUND = 0.06, 0.12
 MARGIN = 0.01  # of the time of `cuda_graph`: less is noise
-ROUNDS = 21
+RACE_TURNS, CALLS = 5, 9  # of each backend, and calls of a turn, beside those that warm it
+PARTS = ("total", "vision", "prefix", "denoise")  # of a call's time
 Figures = dict[str, float]  # by what they are of
 OF_DENOISING = ("x_t", "v_t", "actions")
 
@@ -267,73 +269,49 @@ class Raced:
 
 def race(subject: Subject, quantization: Quantization | None) -> Raced:
     """Calls of the whole model with random weights, of both in turns where the memory is enough for both."""
-    config = subject.policy_config(subject.model)
-    checkpoint = random_checkpoint(config)
-    longest = subject.model.max_prompt_tokens
-    job = Job(2, min(48, longest), subject.model.action_horizon, config.num_denoising_steps)
+    config, model = subject.policy_config(subject.model), subject.model
+    checkpoint, given = random_checkpoint(config), cast(Any, quantization)
+    job = Job(2, min(48, model.max_prompt_tokens), model.action_horizon, config.num_denoising_steps)
+    times: dict[str, list[Figures]] = {}
+    notes = []
 
-    def entrant(name: str) -> _Entrant:
+    def policy(name: str) -> UnifiedPolicy:
         subject.at(f"{name} at full size", "", COMPILING)
-        given: Any = quantization
-        return _Entrant(bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given), job)
+        return bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given)
+
+    def measure(policies: dict[str, UnifiedPolicy], turns: int = RACE_TURNS) -> None:
+        for turn in range(turns):
+            for name in reversed(policies) if turn % 2 else policies:
+                found = measure_calls(policies[name], job, CALLS)
+                times.setdefault(name, []).append({part: found[part].median for part in PARTS if part in found})
 
     _free(subject.device)
-    ours = entrant(subject.name)
-    memory = _reserved(subject.device)
-    if subject.rival is None:
-        in_turns({0: ours.once}, ROUNDS)
-        return Raced({subject.name: ours.medians}, memory, True, "")
-    notes = []
-    try:
-        theirs = entrant(subject.rival)
-        in_turns({0: theirs.once, 1: ours.once}, ROUNDS)
-    except torch.OutOfMemoryError:
-        notes.append("one after the other, as the memory isn't enough for both")
-        in_turns({0: ours.once}, ROUNDS)
-        ours.release()
+    ours = policy(subject.name)
+    measure({subject.name: ours}, 1)
+    memory, both = _reserved(subject.device), False
+    times.clear()
+    if subject.rival is not None:
+        with suppress(torch.OutOfMemoryError):
+            measure({subject.rival: policy(subject.rival), subject.name: ours})
+            both = True
+    if not both:
+        times.clear()
+        measure({subject.name: ours})
+        del ours
         _free(subject.device)
-        theirs = entrant(subject.rival)
-        in_turns({0: theirs.once}, ROUNDS)
-    rows = {0: timed({}, theirs.totals), 1: timed({}, ours.totals)}
+        if subject.rival is not None:
+            notes.append("one after the other, as the memory isn't enough for both")
+            measure({subject.rival: policy(subject.rival)})
+    rows = {name: timed({}, [turn["total"] for turn in turns]) for name, turns in times.items()}
     if busy(row.spread for row in rows.values()):
         notes.append("times varied by more than 15 %: was the GPU used by others?")
-    return Raced(
-        {subject.name: ours.medians, subject.rival: theirs.medians},
-        memory,
-        winner(rows, MARGIN) is rows[1],
-        "; ".join(notes),
-    )
-
-
-class _Entrant:
-    """A warm policy and the times of its calls."""
-
-    def __init__(self, policy: UnifiedPolicy, job: Job) -> None:
-        self._policy: UnifiedPolicy | None = policy
-        self._job, self._observations = job, Observations(policy, job)
-        self._timings: dict[str, list[float]] = {}
-        for _ in range(WARMING):
-            call(policy, job, self._observations)
-
-    def once(self) -> float:
-        """Milliseconds of a call."""
-        assert self._policy is not None
-        timing = call(self._policy, self._job, self._observations)
-        for name in ("total", "vision", "prefix", "denoise"):
-            if f"{name}_ms" in timing:
-                self._timings.setdefault(name, []).append(timing[f"{name}_ms"])
-        return timing["total_ms"]
-
-    @property
-    def totals(self) -> list[float]:
-        return self._timings["total"][-ROUNDS:]
-
-    @property
-    def medians(self) -> dict[str, float]:
-        return {name: round(float(np.median(times[-ROUNDS:])), 3) for name, times in self._timings.items()}
-
-    def release(self) -> None:
-        self._policy = None
+    medians = {
+        name: {part: round(float(np.median([turn[part] for turn in turns])), 3) for part in turns[0]}
+        for name, turns in times.items()
+    }
+    first = rows[subject.rival or subject.name]
+    wins = subject.rival is None or winner({0: first, 1: rows[subject.name]}, MARGIN) is not first
+    return Raced(dict(sorted(medians.items(), key=lambda one: one[0] != subject.name)), memory, wins, "; ".join(notes))
 
 
 def _reserved(device: torch.device) -> int:
