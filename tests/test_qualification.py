@@ -4,8 +4,10 @@ The processes here are stand-ins that say what a GPU's would, or hang, or die.
 """
 
 import json
+import subprocess
 import sys
 import textwrap
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,14 +15,16 @@ from typing import Any
 
 import pytest
 import torch
+from shared import TWO_LAYERS
 
 from turbopi import backends
 from turbopi.backends import qualification
 from turbopi.backends.base import Precision
 from turbopi.backends.fused import FusedBackend
-from turbopi.backends.qualification import DENOISE, Verdict, file_of, kept, qualify
+from turbopi.backends.qualification import DENOISE, STAGES, Verdict, file_of, kept, qualify
 from turbopi.config import ModelConfig
 from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.files import alone_in
 
 GPU, MODEL = torch.device("cuda", 0), ModelConfig()
 RIGHT = """
@@ -227,3 +231,46 @@ def test_a_report_reads_as_it_was_written(child: Child) -> None:
     child(RIGHT)
     verdict = qualify(GPU, "bf16", MODEL)
     assert qualification.read_document(file_of(GPU, "bf16", MODEL), Verdict, ConfigError) == verdict
+
+
+def test_processes_that_want_the_same_take_turns(child: Child, started: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    child(RIGHT)
+    theirs, file = qualify(GPU, "bf16", MODEL), file_of(GPU, "bf16", MODEL)
+    text = file.read_text()
+    file.unlink()
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    with alone_in(file.parent, "a test"):
+        waited: list[str] = []
+
+        def tell(text_now: str, done: int) -> None:
+            waited.append(text_now)
+            file.write_text(text)  # by the process that has the turn
+
+        assert qualify(GPU, "bf16", MODEL, tell=tell) == theirs
+        file.unlink()
+        late = qualify(GPU, "bf16", MODEL, seconds=0)
+    assert waited == ["another process qualifies this GPU"] and len(starts(started)) == 1
+    assert (late.taken, late.failed) == ("cuda_graph", False) and "another process" in late.reason
+
+
+def test_nothing_is_imported_that_a_machine_may_lack() -> None:
+    code = "import sys, turbopi.backends.qualification; sys.exit('triton' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.slow
+def test_the_process_itself_says_all_of_it(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU: PyTorch's backend stands for `fused`."""
+    child("")
+    monkeypatch.setattr(qualification, "_command", lambda: [sys.executable, "-m", "turbopi.qualify"])
+    monkeypatch.setenv("PYTHONPATH", ":".join([str(Path(__file__).parent), str(Path(backends.__file__).parents[2])]))
+    monkeypatch.setenv(qualification.DOUBLE_VARIABLE, "qualify_on_cpu")
+    said: list[tuple[str, int]] = []
+    verdict = qualify(GPU, "bf16", TWO_LAYERS.model, seconds=900, tell=lambda *one: said.append(one))
+    assert not verdict.failed and not verdict.excluded and verdict.log == "", verdict
+    assert [one.name for one in verdict.stages] == list(STAGES[:3]) and verdict.stages[0].figures == {
+        "barrier us": 1.25
+    }
+    assert set(verdict.milliseconds) == {"fused", "cuda_graph"} and verdict.taken in verdict.milliseconds
+    assert verdict.reason.startswith("right; fused ") and {at for at, _ in said} >= {"float32 reference", "kernels"}
+    assert qualification.kept(GPU, "bf16", TWO_LAYERS.model) == verdict

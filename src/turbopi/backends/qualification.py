@@ -34,7 +34,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from turbopi.backends.tuned_tiles import PACKAGE
 from turbopi.config import Kind, Network
-from turbopi.kernels.ops import forced_portable
 from turbopi.quantization.plan import TIERS, Precision
 from turbopi.support.errors import ConfigError, OutputError
 from turbopi.support.files import alone_in, cache_folder, keep_in_cache
@@ -193,7 +192,7 @@ def file_of(device: torch.device, precision: Precision, model: Network) -> Path:
 
 def _about(device: torch.device, precision: Precision, model: Network) -> dict[str, Any]:
     gpu = torch.cuda.get_device_properties(device)
-    on_hopper = (gpu.major, gpu.minor) == (9, 0) and not forced_portable()
+    on_hopper = (gpu.major, gpu.minor) == (9, 0) and os.environ.get("TURBOPI_KERNELS") != "portable"
     return {
         "gpu": gpu.name,
         "compute_capability": f"{gpu.major}.{gpu.minor}",

@@ -20,7 +20,6 @@ from turbopi.qualify.stages import (
     golden,
     race,
     shallow,
-    stretched,
 )
 from turbopi.support.text import significant
 
@@ -75,15 +74,14 @@ def run_stages(subject: Subject, say: Say) -> None:
             exclude(name, f"beside PyTorch's, {why}")
         return kernels() if compared.failed else compared.errors
 
-    few = shallow(subject.model)
-    small = random_checkpoint(subject.policy_config(few))
-    calibration = subject.quantization(small)
     stage(STAGES[0], lambda: check_grid(subject), lambda found: "holds" if found else "left out")
+    small = random_checkpoint(subject.policy_config(shallow(subject.model)))
+    calibration = subject.quantization(small)
     stage(STAGES[1], kernels, lambda errors: f"{len(errors)} operations equal PyTorch's")
     stage(STAGES[2], lambda: certify(subject, small, calibration), _worst)
     if (policy := golden(subject)) is not None:
         stage(STAGES[3], lambda: certify(subject, policy, subject.quantization(policy)), _worst)
-    raced = race(subject, stretched(calibration, few, subject.model))
+    raced = race(subject, calibration)
     said = ", and ".join(f"{name} {times['total']:.2f} ms" for name, times in raced.milliseconds.items())
     taken: Any = subject.name if raced.wins else subject.rival
     reason = f"right; {said}" + (f" ({raced.note})" if raced.note else "")

@@ -4,7 +4,7 @@ import gc
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,19 +98,18 @@ class Subject:
         return Progress(lambda text, total: self.at(text, "", COMPILING), lambda: self.at("", "", 0.0))
 
 
-def stretched(quantization: Quantization | None, shallow: Any, model: Any) -> Quantization | None:
-    """Of all layers, from those of the shallow model: the last ones are alike, and so are all others."""
-    if quantization is None:
-        return None
+def stretched(quantization: Quantization, checkpoint: Checkpoint) -> Quantization:
+    """For all layers of a checkpoint, from the shallow model's: the last ones are alike, and so are all others."""
+    model = checkpoint.config.planned_model
 
     def origin(site: Site) -> str:
         part = "vlm" if site.part == "prefix" else site.part
-        deep, few = getattr(model, part).depth, getattr(shallow, part).depth
+        deep, few = getattr(model, part).depth, getattr(shallow(model), part).depth
         layer = few - 1 if site.layer + 1 == deep else min(site.layer, max(few - 2, 0))
         return str(replace(site, layer=layer))
 
     found = {str(site): quantization.sites[origin(site)] for site in sites(model)}
-    return replace(quantization, shapes=shapes_of(model), sites=found)
+    return replace(quantization, fingerprint=checkpoint.fingerprint(), shapes=shapes_of(model), sites=found)
 
 
 def shallow(config: Any) -> Any:
@@ -270,7 +269,8 @@ class Raced:
 def race(subject: Subject, quantization: Quantization | None) -> Raced:
     """Calls of the whole model with random weights, of both in turns where the memory is enough for both."""
     config, model = subject.policy_config(subject.model), subject.model
-    checkpoint, given = random_checkpoint(config), cast(Any, quantization)
+    checkpoint = random_checkpoint(config)
+    given: Any = None if quantization is None else stretched(quantization, checkpoint)
     job = Job(2, min(48, model.max_prompt_tokens), model.action_horizon, config.num_denoising_steps)
     times: dict[str, list[Figures]] = {}
     notes = []
