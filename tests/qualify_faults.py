@@ -1,4 +1,4 @@
-"""Faults for the process that qualifies a GPU, which imports this module (`qualification.DOUBLE_VARIABLE`).
+"""Faults for the process that qualifies a GPU, which imports this module (`qualifying.DOUBLE_VARIABLE`).
 
 TURBOPI_PLANTED names the one that is planted.
 """

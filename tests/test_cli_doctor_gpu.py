@@ -12,7 +12,7 @@ from cli_helpers import refusal, turbopi
 from tile_helpers import tile_document, verdict
 
 from turbopi import backends
-from turbopi.backends import Precision, qualification, tuned_tiles
+from turbopi.backends import Precision, qualification, qualifying, tuned_tiles
 from turbopi.backends.qualification import Verdict
 from turbopi.bench.measured import measured_calls
 from turbopi.cli import doctor, gpu_checkups
@@ -153,8 +153,8 @@ def qualify(monkeypatch: pytest.MonkeyPatch, found: Verdict, *options: str) -> t
     monkeypatch.setattr(backends, "refusal", lambda *given: None)
     monkeypatch.setattr(backends, "resolve_device", lambda device: torch.device("cuda", 0))
     monkeypatch.setattr(doctor, "list_backends", lambda device, precision: {})
-    monkeypatch.setattr(qualification, "_verdict", lambda *given: found)
-    monkeypatch.setattr(qualification, "_attempt", lambda *given: qualification._Run(finished=True))
+    monkeypatch.setattr(qualifying, "_verdict", lambda *given: found)
+    monkeypatch.setattr(qualifying, "_attempt", lambda *given: qualifying._Run(finished=True))
     result = turbopi("doctor", "--qualify", "--json", *options)
     return result.exit_code, json.loads(result.stdout)
 

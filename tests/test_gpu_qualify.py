@@ -10,8 +10,9 @@ import qualify_faults
 import torch
 
 from turbopi import UnifiedPolicy
-from turbopi.backends import qualification
-from turbopi.backends.qualification import DENOISE, STAGES, Verdict
+from turbopi.backends import qualification, qualifying
+from turbopi.backends.qualification import DENOISE, Verdict
+from turbopi.backends.qualifying import STAGES, qualify
 from turbopi.checkpoint import Checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.config import PRESETS, PolicyConfig
@@ -44,10 +45,10 @@ def few_layers(base: PolicyConfig, **sizes: Any) -> Checkpoint:
 @pytest.fixture
 def unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
     monkeypatch.setenv(qualification.UNKNOWN_VARIABLE, "1")
-    monkeypatch.setenv(qualification.DOUBLE_VARIABLE, qualify_faults.__name__)
+    monkeypatch.setenv(qualifying.DOUBLE_VARIABLE, qualify_faults.__name__)
     monkeypatch.setenv("PYTHONPATH", f"{Path(__file__).parent}:{Path(qualification.__file__).parents[2]}")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(qualification, "SECONDS", TIMES_UP_NEVER)
+    monkeypatch.setattr(qualifying, "SECONDS", TIMES_UP_NEVER)
     return monkeypatch
 
 
@@ -104,7 +105,7 @@ def test_every_planted_fault_ends_in_a_policy_that_works(
 
 def test_fp8_is_qualified_without_a_rival(unknown: pytest.MonkeyPatch) -> None:
     model = few_layers(PRESETS["pi05_base"], vocab_size=1024, action_horizon=10).config.model
-    verdict = qualification.qualify(GPU, "fp8", model)
+    verdict = qualify(GPU, "fp8", model)
     print(verdict)
     assert (verdict.taken, verdict.failed, verdict.excluded) == ("fused", False, {}) and "fused" in verdict.milliseconds
 

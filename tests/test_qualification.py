@@ -9,6 +9,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,10 +19,11 @@ import torch
 from shared import TWO_LAYERS
 
 from turbopi import backends
-from turbopi.backends import qualification
+from turbopi.backends import qualification, qualifying
 from turbopi.backends.base import Precision
 from turbopi.backends.fused import FusedBackend
-from turbopi.backends.qualification import DENOISE, STAGES, Verdict, file_of, kept, qualify
+from turbopi.backends.qualification import DENOISE, Verdict, file_of, kept
+from turbopi.backends.qualifying import STAGES, qualify
 from turbopi.config import ModelConfig
 from turbopi.support.errors import BackendUnavailable, ConfigError
 from turbopi.support.files import alone_in
@@ -62,9 +64,7 @@ def child(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, started: Path) -> Chi
         say = lambda **event: print(json.dumps(event), flush=True)
         hang = lambda: time.sleep(600)
         """
-        monkeypatch.setattr(
-            qualification, "_command", lambda: [sys.executable, "-S", "-c", textwrap.dedent(head) + code]
-        )
+        monkeypatch.setattr(qualifying, "_command", lambda: [sys.executable, "-S", "-c", textwrap.dedent(head) + code])
 
     return runs
 
@@ -164,8 +164,8 @@ def test_time_is_up_at_most_twice_and_then_doctor_is_named(
     child: Child, started: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     child('say(at="cuda_graph at full size", quiet=99.0)\nhang()')
-    monkeypatch.setattr(qualification, "SECONDS", 0.5)
-    assert [chosen() for _ in range(4)] == ["cuda_graph"] * 4 and len(starts(started)) == qualification.TURNS
+    monkeypatch.setattr(qualifying, "SECONDS", 0.5)
+    assert [chosen() for _ in range(4)] == ["cuda_graph"] * 4 and len(starts(started)) == qualifying.TURNS
     why = backends.choose(GPU, "bf16", MODEL)[1]
     assert "time was up at cuda_graph at full size; `turbopi doctor --qualify` takes up to 600 s" in why
     assert chosen("fp8") == "fused", "nothing is wrong with it"
@@ -184,7 +184,7 @@ def test_a_reason_that_may_be_gone_next_time_is_not_kept(fault: str, child: Chil
 def test_a_process_that_can_not_be_started_is_no_fault_of_the_gpu(
     child: Child, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(qualification, "_command", lambda: ["/nowhere/python"])
+    monkeypatch.setattr(qualifying, "_command", lambda: ["/nowhere/python"])
     assert chosen() == "cuda_graph"
     assert "no process could be started" in backends.choose(GPU, "bf16", MODEL)[1]
 
@@ -236,23 +236,24 @@ def test_a_report_reads_as_it_was_written(child: Child) -> None:
 def test_processes_that_want_the_same_take_turns(child: Child, started: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     child(RIGHT)
     theirs, file = qualify(GPU, "bf16", MODEL), file_of(GPU, "bf16", MODEL)
-    text = file.read_text()
+    text, other, waited = file.read_text(), ExitStack(), list[str]()
     file.unlink()
+    other.enter_context(alone_in(file.parent, "a test"))
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
-    with alone_in(file.parent, "a test"):
-        waited: list[str] = []
 
-        def tell(text_now: str, done: int) -> None:
-            waited.append(text_now)
-            file.write_text(text)  # by the process that has the turn
+    def tell(at: str, done: int) -> None:
+        waited.append(at)
+        file.write_text(text)  # by the process that has the turn, which ends
+        other.close()
 
-        assert qualify(GPU, "bf16", MODEL, tell=tell) == theirs
-        file.unlink()
-        late = qualify(GPU, "bf16", MODEL, seconds=0)
+    assert qualify(GPU, "bf16", MODEL, tell=tell) == theirs
     assert waited == ["another process qualifies this GPU"] and len(starts(started)) == 1
+    with alone_in(file.parent, "a test"):
+        late = qualify(GPU, "bf16", MODEL, seconds=0)
     assert (late.taken, late.failed) == ("cuda_graph", False) and "another process" in late.reason
 
 
+@pytest.mark.slow
 def test_nothing_is_imported_that_a_machine_may_lack() -> None:
     code = "import sys, turbopi.backends.qualification; sys.exit('triton' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -262,9 +263,9 @@ def test_nothing_is_imported_that_a_machine_may_lack() -> None:
 def test_the_process_itself_says_all_of_it(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a CPU: PyTorch's backend stands for `fused`."""
     child("")
-    monkeypatch.setattr(qualification, "_command", lambda: [sys.executable, "-m", "turbopi.qualify"])
+    monkeypatch.setattr(qualifying, "_command", lambda: [sys.executable, "-m", "turbopi.qualify"])
     monkeypatch.setenv("PYTHONPATH", ":".join([str(Path(__file__).parent), str(Path(backends.__file__).parents[2])]))
-    monkeypatch.setenv(qualification.DOUBLE_VARIABLE, "qualify_on_cpu")
+    monkeypatch.setenv(qualifying.DOUBLE_VARIABLE, "qualify_on_cpu")
     said: list[tuple[str, int]] = []
     verdict = qualify(GPU, "bf16", TWO_LAYERS.model, seconds=900, tell=lambda *one: said.append(one))
     assert not verdict.failed and not verdict.excluded and verdict.log == "", verdict

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from turbopi import backends
 from turbopi.backends import qualification
-from turbopi.backends.qualification import DENOISE, STAGES, Event
+from turbopi.backends.qualification import DENOISE
+from turbopi.backends.qualifying import STAGES, Event
 from turbopi.config import PRESETS, Network
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN

@@ -12,17 +12,9 @@ from pathlib import Path
 
 import torch
 
+from turbopi.backends import qualifying
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
-from turbopi.backends.qualification import (
-    COMMAND,
-    TURNS,
-    Verdict,
-    file_of,
-    is_known,
-    qualify,
-    shown,
-    verdict_of,
-)
+from turbopi.backends.qualification import COMMAND, Verdict, file_of, is_known, verdict_of
 from turbopi.config import ModelConfig, Network
 from turbopi.engine.graph import preparing
 from turbopi.models import family_of
@@ -246,10 +238,10 @@ def qualified(device: torch.device, precision: Precision, model: Network, *, bar
     if device.type != "cuda" or is_known(device) or refusal("fused", device, precision, model) is not None:
         return
     verdict = verdict_of(device, precision, model)
-    if verdict is None or 0 < verdict.unfinished < TURNS:
+    if verdict is None or 0 < verdict.unfinished < qualifying.TURNS:
         what = f"backend 'fused' for {family_of(model).label} in {precision} on {torch.cuda.get_device_name(device)}"
-        with shown(bar, what) as tell:
-            verdict = qualify(device, precision, model, tell=tell)
+        with qualifying.shown(bar, what, qualifying.SECONDS) as tell:
+            verdict = qualifying.qualify(device, precision, model, tell=tell)
     check_verdict(verdict, file_of(device, precision, model))
 
 

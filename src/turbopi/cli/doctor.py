@@ -84,7 +84,7 @@ def run_qualification(
 ) -> dict[str, Any]:
     """The verdict on `fused` on a GPU, and its file, said and as JSON values. Raises BackendUnavailable without one."""
     from turbopi import backends
-    from turbopi.backends import qualification
+    from turbopi.backends import qualification, qualifying
     from turbopi.checkpoint import open_checkpoint
     from turbopi.config import ModelConfig, Network
 
@@ -96,9 +96,9 @@ def run_qualification(
         raise BackendUnavailable(f"there is nothing to qualify: {why}")
     verdict = None if force else qualification.kept(resolved, tier, model)
     if verdict is None or verdict.unfinished:
-        seconds = qualification.PATIENT_SECONDS
-        with qualification.shown(output.shows_progress, f"backend 'fused' in {tier}", seconds) as tell:
-            verdict = qualification.qualify(resolved, tier, model, seconds=seconds, tell=tell)
+        seconds = qualifying.PATIENT_SECONDS
+        with qualifying.shown(output.shows_progress, f"backend 'fused' in {tier}", seconds) as tell:
+            verdict = qualifying.qualify(resolved, tier, model, seconds=seconds, tell=tell)
     file = qualification.file_of(resolved, tier, model)
     for stage in verdict.stages:
         output.line(f"{stage.name}: {stage.text} ({stage.seconds:.1f} s)")

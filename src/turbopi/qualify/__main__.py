@@ -9,7 +9,7 @@ import sys
 import msgspec
 import torch
 
-from turbopi.backends.qualification import DOUBLE_VARIABLE, Event, Request
+from turbopi.backends.qualifying import DOUBLE_VARIABLE, Event, Request
 from turbopi.models import RANDOM
 from turbopi.qualify.run import run
 from turbopi.qualify.stages import Subject

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 
 from turbopi.backends import qualification
-from turbopi.backends.qualification import STAGES, Event, Stage
+from turbopi.backends.qualification import Stage
+from turbopi.backends.qualifying import STAGES, Event
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.qualify.stages import (
     COMPILING,
