@@ -12,14 +12,16 @@ from typing import Any
 import pytest
 import torch
 import verify_fakes
-from shared import SIX_LAYERS, TWO_LAYERS
+from shared import SIX_LAYERS, TWO_LAYERS, golden_model
 from test_engine import answer, made_up, shape_of, static_call
+from test_fused_choice import OnCpu, kernels  # noqa: F401
 from torch import Tensor
 
 from turbopi import backends
 from turbopi.backends import qualification
 from turbopi.backends.qualification import DENOISE
 from turbopi.backends.qualifying import STAGES, Event
+from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.config import PRESETS, Network
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
@@ -121,6 +123,61 @@ def test_what_failed_is_left_to_pytorch_and_said(monkeypatch: pytest.MonkeyPatch
     found = ops.fused_ops(CPU, without={"attention": "wrong", "batch": "wrong", "sm90": "wrong", DENOISE: "wrong"})
     assert found.attention is PLAIN.attention and found.batch is None and found.linear is not PLAIN.linear
     assert found.origin["attention, batch, excluded by a self-test"] == "PyTorch"
+
+
+# -- a backend's call --------------------------------------------------------------------------------------------------
+
+
+class WrongGeglu(OnCpu):
+    def _make_ops(self) -> Ops:
+        given = {"linear_geglu": PLAIN.linear_geglu} if "linear_geglu" in self._without else {}
+        return dataclasses.replace(PLAIN, linear_geglu=wrong_tile(PLAIN.linear_geglu), **given)  # type: ignore[arg-type]
+
+
+class WrongBatch(OnCpu):
+    """Two observations together give the first one's actions twice."""
+
+    def sample(self, observation: Any, *given: Any, **named: Any) -> Any:
+        found = super().sample(observation, *given, **named)
+        if observation.batch_size > 1 and "batch" not in self._without:
+            found.actions[1] = found.actions[0]
+        return found
+
+
+def checked(
+    cls: str, monkeypatch: pytest.MonkeyPatch, excluded: dict[str, str] | None = None, model: Any = TWO_LAYERS.model
+) -> Any:
+    """What `check_kernels` finds in a `fused` that runs on a CPU, and the events."""
+    spec = backends.BackendSpec("on_cpu", __name__, cls, "a test's")
+    monkeypatch.setitem(backends.BACKENDS, "on_cpu", spec)
+    begun: list[tuple[str, str]] = []
+    without = {} if excluded is None else excluded
+    monkeypatch.setattr(qualification, "under_test", without)
+    subject = Subject(model, "bf16", CPU, lambda what, path, quiet: begun.append((what, path)), without, name="on_cpu")
+    checkpoint = random_checkpoint(subject.policy_config(model))
+    return stages.check_kernels(subject, checkpoint, None), begun
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("kernels")
+def test_a_right_call_is_compared_and_its_denoising_kernel_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = dataclasses.replace(golden_model("pi05").config, vocab_size=1024)
+    comparison, begun = checked("OnCpu", monkeypatch, model=model)
+    assert comparison.failed == {}
+    assert begun.count(("the denoising kernel", DENOISE)) >= 3, "when it is made, and at each launch"
+    assert ("a batch of two", "batch") in begun and begun[-1] == ("kernels", "")
+
+
+def test_a_wrong_operation_of_a_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    comparison, _ = checked("WrongGeglu", monkeypatch, {DENOISE: "not on a CPU"})
+    assert set(comparison.failed) == {"linear_geglu"}
+
+
+def test_a_batch_that_is_wrong_is_a_path_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Faulty, match="a batch's actions are off by") as fault:
+        checked("WrongBatch", monkeypatch, {DENOISE: "not on a CPU"})
+    assert fault.value.path == "batch"
+    assert checked("WrongBatch", monkeypatch, {DENOISE: "not on a CPU", "batch": "wrong"})[0].failed == {}
 
 
 # -- sizes -------------------------------------------------------------------------------------------------------------
