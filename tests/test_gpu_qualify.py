@@ -77,8 +77,8 @@ def test_a_sound_gpu_takes_fused_and_finds_nothing_wrong(
     verdict = verdict_of(policy)
     assert (verdict.excluded, verdict.failed, verdict.kernels) == ({}, False, {"auto": "hopper"}.get(kernels, kernels))
     assert policy.metadata["backend"] == verdict.taken == "fused" and is_right(policy, checkpoint)
-    golden = [STAGES[3]] if base is not BASE else []  # no small SmolVLA ships
-    assert [one.name for one in verdict.stages] == [*STAGES[:3], *golden]
+    golden = [STAGES[4]] if base is not BASE else []  # no small SmolVLA ships
+    assert [one.name for one in verdict.stages] == [*STAGES[:4], *golden]
 
 
 @pytest.mark.parametrize("fault", list(qualify_faults.FAULTS))

@@ -32,6 +32,7 @@ GPU, MODEL = torch.device("cuda", 0), ModelConfig()
 RIGHT = """
 say(stage={"name": "grid barrier", "seconds": 1.0, "text": "holds", "figures": {"barrier us": 1.2}})
 say(milliseconds={"fused": {"total": 20.0}, "cuda_graph": {"total": 30.0}}, memory=7, taken="fused", reason="right")
+say(done=True)
 """
 Child = Callable[[str], None]
 
@@ -171,6 +172,15 @@ def test_time_is_up_at_most_twice_and_then_doctor_is_named(
     assert chosen("fp8") == "fused", "nothing is wrong with it"
 
 
+def test_time_that_is_up_behind_the_race_leaves_its_result(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    child(RIGHT.replace("say(done=True)", 'say(at="the shipped policy", quiet=99.0)\nhang()'))
+    monkeypatch.setattr(qualifying, "SECONDS", 0.7)
+    assert chosen() == "fused"
+    verdict = kept(GPU, "bf16", MODEL)
+    assert verdict is not None and verdict.reason == "right; time was up at the shipped policy"
+    assert verdict.unfinished == 0 and verdict.milliseconds["fused"] == {"total": 20.0}
+
+
 @pytest.mark.parametrize("fault", ['say(at="a", failed="out of memory", transient=True); sys.exit(1)', "sys.exit(9)"])
 def test_a_reason_that_may_be_gone_next_time_is_not_kept(fault: str, child: Child, started: Path) -> None:
     child(fault)
@@ -269,7 +279,7 @@ def test_the_process_itself_says_all_of_it(child: Child, monkeypatch: pytest.Mon
     said: list[tuple[str, int]] = []
     verdict = qualify(GPU, "bf16", TWO_LAYERS.model, seconds=900, tell=lambda *one: said.append(one))
     assert not verdict.failed and not verdict.excluded and verdict.log == "", verdict
-    assert [one.name for one in verdict.stages] == list(STAGES[:3]) and verdict.stages[0].figures == {
+    assert [one.name for one in verdict.stages] == list(STAGES[:4]) and verdict.stages[0].figures == {
         "barrier us": 1.25
     }
     assert set(verdict.milliseconds) == {"fused", "cuda_graph"} and verdict.taken in verdict.milliseconds

@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 SECONDS, PATIENT_SECONDS = 60.0, 600.0  # at most: when a policy is made; ahead
 ATTEMPTS: Final = 4  # processes at most: one that died may be followed by one without what it died of
 TURNS: Final = 2  # starts whose time is up until `auto` leaves it to `doctor`: the second one finds compiled kernels
-STAGES: Final = ("grid barrier", "kernels", "the model's sizes", "the shipped policy", "race")
+STAGES: Final = ("grid barrier", "kernels", "the model's sizes", "race", "the shipped policy")
 DOUBLE_VARIABLE: Final = "TURBOPI_QUALIFY_DOUBLE"  # a module that the process imports first: planted faults
 Tell = Callable[[str, int], None]  # what is done now, and how many of STAGES are
 
@@ -45,6 +45,7 @@ class Event(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A line of what the process says.
 
     at, quiet, path  what it does now; for how many seconds it may say nothing; what to exclude if that fails
+    reason           why that is taken, of what was tried so far
     failed           why it ends; transient: for a reason that may be gone next time
     """
 
@@ -57,6 +58,7 @@ class Event(Struct, frozen=True, kw_only=True, omit_defaults=True):
     memory: int = 0
     taken: Taken | None = None
     reason: str = ""
+    done: bool = False
     failed: str = ""
     transient: bool = False
 
@@ -136,6 +138,7 @@ class _Run:
     milliseconds: dict[str, dict[str, float]] = field(default_factory=dict)
     memory: int = 0
     taken: Taken | None = None
+    reason: str = ""  # of what is taken
     finished: bool = False
     why: str = ""
     path: str = ""
@@ -216,6 +219,8 @@ def _listen(process: "subprocess.Popen[bytes]", run: _Run, end: float, tell: Tel
             run.time_up, run.why = quiet >= left, f"{at} said nothing for {quiet:.0f} s, as if it waited for ever"
             if run.time_up:
                 run.why = f"time was up at {at}; {COMMAND} takes up to {PATIENT_SECONDS:.0f} s"
+            if run.time_up and run.reason:
+                run.why, run.finished, run.time_up = f"{run.reason}; time was up at {at}", True, False
             return
         if line is None:
             run.why, run.soon = f"{at}: the process ended with code {process.wait()}", at == "its start"
@@ -232,8 +237,10 @@ def _listen(process: "subprocess.Popen[bytes]", run: _Run, end: float, tell: Tel
         tell(at, len(run.stages))
         run.excluded |= one.excluded
         if one.reason:
-            run.taken, run.why, run.finished = one.taken, one.reason, True
+            run.taken, run.reason = one.taken, one.reason
             run.milliseconds, run.memory = one.milliseconds, one.memory
+        if one.done:
+            run.why, run.finished = run.reason, True
 
 
 def _read(stream: IO[bytes], lines: "queue.SimpleQueue[bytes | None]") -> None:

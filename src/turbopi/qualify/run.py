@@ -80,13 +80,26 @@ def run_stages(subject: Subject, say: Say) -> None:
     calibration = subject.quantization(small)
     stage(STAGES[1], kernels, lambda errors: f"{len(errors)} operations equal PyTorch's")
     stage(STAGES[2], lambda: certify(subject, small, calibration), _worst)
+
+    def timed() -> Figures:
+        raced = race(subject, calibration)
+        figures = {f"{name} ms": times["total"] for name, times in raced.milliseconds.items()}
+        reason = f"right; {_times(figures)}" + (f" ({raced.note})" if raced.note else "")
+        taken: Any = subject.name if raced.wins else subject.rival
+        say(Event(milliseconds=raced.milliseconds, memory=raced.memory, taken=taken, reason=reason))
+        return figures
+
+    stage(STAGES[3], timed, _times)
+    raced_without = set(subject.excluded)
     if (policy := golden(subject)) is not None:
-        stage(STAGES[3], lambda: certify(subject, policy, subject.quantization(policy)), _worst)
-    raced = race(subject, calibration)
-    said = ", and ".join(f"{name} {times['total']:.2f} ms" for name, times in raced.milliseconds.items())
-    taken: Any = subject.name if raced.wins else subject.rival
-    reason = f"right; {said}" + (f" ({raced.note})" if raced.note else "")
-    say(Event(milliseconds=raced.milliseconds, memory=raced.memory, taken=taken, reason=reason))
+        stage(STAGES[4], lambda: certify(subject, policy, subject.quantization(policy)), _worst)
+    if raced_without != set(subject.excluded):
+        timed()
+    say(Event(done=True))
+
+
+def _times(figures: Figures) -> str:
+    return ", and ".join(f"{name.removesuffix(' ms')} {ms:.2f} ms" for name, ms in figures.items())
 
 
 def _worst(figures: Figures) -> str:
