@@ -9,6 +9,7 @@ import pytest
 import torch
 from compile_for_all.document import Compiled, CompiledForAll, written
 from doc_tables import gpus as tables
+from tile_helpers import verdict
 
 from turbopi import backends
 from turbopi.backends import qualification
@@ -18,6 +19,7 @@ from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
 from turbopi.support.errors import BackendUnavailable
+from turbopi.support.reading import plain_document
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
@@ -110,6 +112,23 @@ def test_cases_run_as_ptx_count_for_their_gpu_and_newer_ones(tmp_path: Path) -> 
     rows[2]["problem"] = "differs"
     (tmp_path / "h100_2026-11-27_ptx.json").write_text(json.dumps({"rows": rows}))
     assert cells(tables.gpus(tmp_path), "Jetson AGX Thor (T5000)")[head] == "2 of 3"
+
+
+def test_a_users_report_is_a_line(tmp_path: Path) -> None:
+    assert tables.gpu_reports(tmp_path) == ["No report is here yet."]
+    (tmp_path / "qualified").mkdir()
+    raced = {"fused": {"total": 24.123}, "cuda_graph": {"total": 31.0}}
+    reports = [
+        verdict(milliseconds=raced, excluded={"batch": "its error is 1"}),
+        verdict(precision="fp8", taken=None, failed=True, reason="its self-test failed: a | b"),
+    ]
+    for number, one in enumerate(reports):
+        (tmp_path / "qualified" / f"{number}.json").write_text(json.dumps(plain_document(one)))
+    about = "| NVIDIA GeForce RTX 4090 | 580.95.05 | pi05 |"
+    assert tables.gpu_reports(tmp_path)[2:] == [
+        f"{about} bf16 | 24.12 | 31.00 | fused | batch | 0.2.0 |",
+        f"{about} fp8 |  |  | nothing | its self-test failed: a / b | 0.2.0 |",
+    ]
 
 
 def test_predictions_are_of_the_backend_that_runs_there() -> None:

@@ -24,6 +24,7 @@ from turbopi.backends.qualifying import STAGES, Event
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.config import PRESETS, Network
 from turbopi.kernels.interface import Ops
+from turbopi.kernels.ops import BESIDE
 from turbopi.kernels.plain import PLAIN
 from turbopi.models.smolvla.family import BASE
 from turbopi.qualify import run, stages
@@ -106,6 +107,23 @@ def test_an_operation_that_is_wrong_is_named_and_the_call_goes_on_right(
         assert torch.equal(actions, call_with(PLAIN)), "PyTorch's result goes on"
 
 
+def test_parts_of_a_matmul_are_added_up() -> None:
+    def parts(x: Tensor, weight: Any, bias: Tensor | None = None) -> Tensor:
+        half = PLAIN.linear(x, weight, bias).float() / 2
+        return torch.stack((half, half))
+
+    norms: Any = {name: in_order(getattr(BESIDE, name)) for name in ("residual_rms_norm", "residual_layer_norm")}
+    comparison = Comparison(CPU, lambda *event: None)
+    actions = call_with(comparison.around(dataclasses.replace(PLAIN, residual_linear=parts, **norms)))
+    assert comparison.failed == {} and {"residual_linear", *norms} <= comparison.errors.keys()
+    assert torch.equal(actions, call_with(PLAIN))
+
+
+def in_order(given: Callable[..., Any]) -> Callable[..., Any]:
+    """The same by another name, which is compared."""
+    return lambda *args, **named: given(*args, **named)
+
+
 def test_a_gpu_that_is_lost_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def lost(*args: Any) -> Any:
         raise RuntimeError("CUDA error: an illegal memory access was encountered")
@@ -122,6 +140,7 @@ def test_what_failed_is_left_to_pytorch_and_said(monkeypatch: pytest.MonkeyPatch
     assert ops.hopper_kernels(CPU) and not ops.hopper_kernels(CPU, {"sm90": "it hangs"})
     found = ops.fused_ops(CPU, without={"attention": "wrong", "batch": "wrong", "sm90": "wrong", DENOISE: "wrong"})
     assert found.attention is PLAIN.attention and found.batch is None and found.linear is not PLAIN.linear
+    assert ops.fused_ops(CPU, without={"residual_rms_norm", "sm90"}).residual_rms_norm is BESIDE.residual_rms_norm
     assert found.origin["attention, batch, excluded by a self-test"] == "PyTorch"
 
 

@@ -1,11 +1,12 @@
 """The engine's operations on an NVIDIA GPU: its generation's own kernels where there are some, else those for all."""
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import fields, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
@@ -16,6 +17,21 @@ from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
 from turbopi.support.errors import ConfigError
 
 KERNELS_VARIABLE = "TURBOPI_KERNELS"
+
+
+def _adding_parts(norm: Callable[..., Any]) -> Callable[..., Any]:
+    def residual_norm(x: Tensor, y: Tensor | None, *given: Any, **named: Any) -> Any:
+        return norm(x, y.float().sum(0).to(x.dtype) if y is not None and y.dim() == 3 else y, *given, **named)
+
+    return residual_norm
+
+
+# `PLAIN` among kernels, whose matmuls may leave parts for the norm behind them
+BESIDE = replace(
+    PLAIN,
+    residual_rms_norm=_adding_parts(PLAIN.residual_rms_norm),
+    residual_layer_norm=_adding_parts(PLAIN.residual_layer_norm),
+)
 
 
 def forced_portable() -> bool:
@@ -43,7 +59,7 @@ def fused_ops(device: torch.device, tiles: TileTable = NO_TILES, without: Collec
              Hopper's
     """
     ops = ops_of("hopper" if hopper_kernels(device, without) else "portable", device, tiles)
-    instead: dict[str, Any] = {one.name: getattr(PLAIN, one.name) for one in fields(Ops) if one.name in without}
+    instead: dict[str, Any] = {one.name: getattr(BESIDE, one.name) for one in fields(Ops) if one.name in without}
     if not instead:
         return ops
     return replace(ops, **instead, origin={**ops.origin, f"{', '.join(instead)}, excluded by a self-test": "PyTorch"})

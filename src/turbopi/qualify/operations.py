@@ -15,6 +15,7 @@ from torch import Tensor
 from turbopi.backends.device_lost import Guard
 from turbopi.backends.qualification import DENOISE
 from turbopi.kernels.interface import Ops
+from turbopi.kernels.ops import BESIDE
 from turbopi.kernels.plain import PLAIN
 from turbopi.tune.race import first_line, wrong
 
@@ -26,9 +27,10 @@ At = Callable[[str, str, float], None]  # what begins, what to exclude if it fai
 
 
 class Comparison:
-    """errors: the worst of each operation that was compared; failed: why one isn't right."""
+    """errors: the worst of each operation that was compared; failed: why one isn't right; compares: whether it does."""
 
     def __init__(self, device: torch.device, at: At) -> None:
+        self.compares = True
         self.errors: dict[str, float] = {}
         self.failed: dict[str, str] = {}
         self._at, self._device, self._guard = at, device, Guard(device)
@@ -37,8 +39,8 @@ class Comparison:
         """The same operations, each compared while no graph is captured. One without a reference stays as it is."""
         compared: dict[str, Any] = {}
         for one in fields(Ops):
-            ours, plain = getattr(ops, one.name), getattr(PLAIN, one.name)
-            if callable(ours) and callable(plain) and ours is not plain:
+            ours, plain = getattr(ops, one.name), getattr(BESIDE, one.name)
+            if callable(ours) and callable(plain) and ours not in (plain, getattr(PLAIN, one.name)):
                 compared[one.name] = partial(self._both, one.name, ours, plain)
         return replace(ops, **compared)
 
@@ -64,7 +66,7 @@ class Comparison:
     def _both(self, name: str, ours: Callable[..., Any], plain: Callable[..., Any], *given: Any, **named: Any) -> Any:
         if name in self.failed:
             return plain(*given, **named)
-        if capturing():
+        if not self.compares or capturing():
             return ours(*given, **named)
         if name not in self.errors:
             self._at(f"operation {name}", name, COMPILING)

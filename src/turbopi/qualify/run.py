@@ -63,11 +63,8 @@ def run_stages(subject: Subject, say: Say) -> None:
                 if not fault.path or fault.path in subject.excluded:
                     raise
                 exclude(fault.path, str(fault))
-        say(
-            Event(
-                stage=Stage(name=name, seconds=round(time.monotonic() - began, 2), text=text(figures), figures=figures)
-            )
-        )
+        seconds = round(time.monotonic() - began, 2)
+        say(Event(stage=Stage(name=name, seconds=seconds, text=text(figures), figures=figures)))
 
     def kernels() -> Figures:
         compared = check_kernels(subject, small, calibration)

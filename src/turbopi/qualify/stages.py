@@ -183,6 +183,7 @@ def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quanti
     )
     alone = [backend.sample(Observation.stack([one]), noise[i : i + 1], steps) for i, one in enumerate(inputs)]
     if cls.runs_batches and not compared.failed and "batch" not in subject.excluded:
+        compared.compares = False  # rows of a batch's padding may be anything
         subject.at("a batch of two", "batch", COMPILING)
         together = backend.sample(Observation.stack(inputs), noise, steps)
         _check_batch(together, alone, EIGHT_BITS_BATCH_BOUND if subject.precision in TIERS else BATCH_BOUND)
