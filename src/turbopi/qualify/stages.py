@@ -27,7 +27,7 @@ from turbopi.policy import shipped
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
-from turbopi.qualify.operations import COMPILING, RUNNING, At, Comparison
+from turbopi.qualify.operations import COMPILING, At, Comparison
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, shapes_of
 from turbopi.quantization.plan import TIERS, Precision, format_of
 from turbopi.quantization.sites import Site, sites
@@ -147,7 +147,7 @@ def check_grid(subject: Subject) -> Figures:
     """The barrier's cost. The denoising kernel alone has one."""
     if DENOISE in subject.excluded:
         return {}
-    subject.at("the grid's barrier", DENOISE, RUNNING)
+    subject.at("the grid's barrier", DENOISE, COMPILING)  # it gives up by itself
     try:
         why = check_barrier(subject.device)
     except BackendUnavailable as failure:
