@@ -243,10 +243,10 @@ def write_tile_file(document: TileFile, file: Path) -> None:
     """Whole or not at all, a tile on a line. Raises OutputError if it can't be written."""
     make_folder(file)
     about = plain_document(document)
-    tiles = ",\n  ".join(json.dumps(plain_document(tile)) for tile in document.tiles)
+    tiles = ",\n".join(json.dumps(plain_document(tile), separators=(",", ":")) for tile in document.tiles)
     del about["tiles"]
     begin = json.dumps(about, indent=1).removesuffix("\n}")
-    write_whole(file, f'{begin},\n "tiles": [\n  {tiles}\n ]\n}}\n')
+    write_whole(file, f'{begin},\n "tiles": [\n{tiles}\n]\n}}\n')
 
 
 def knobs_text(knobs: Knobs) -> str:
