@@ -12,7 +12,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -22,7 +21,7 @@ from turbopi import backends
 from turbopi.backends import qualification, qualifying
 from turbopi.backends.base import Precision
 from turbopi.backends.fused import FusedBackend
-from turbopi.backends.qualification import DENOISE, Verdict, file_of, kept
+from turbopi.backends.qualification import DENOISE, file_of, kept
 from turbopi.backends.qualifying import STAGES, qualify
 from turbopi.config import ModelConfig
 from turbopi.support.errors import BackendUnavailable, ConfigError
@@ -223,24 +222,11 @@ def test_a_verdict_names_no_user(child: Child) -> None:
     assert "~/code.py" in file_of(GPU, "bf16", MODEL).read_text()
 
 
-def test_the_process_is_told_the_models_sizes(child: Child, tmp_path: Path) -> None:
-    child(f'json.dump(request, open({str(tmp_path / "request")!r}, "w"))\n{RIGHT}')
-    chosen()
-    given: Any = json.loads((tmp_path / "request").read_text())
-    assert (given["kind"], given["model"]["vlm"]["depth"], given["precision"]) == ("pi05", 18, "bf16")
-
-
 def test_known_gpus_are_those_with_checked_in_results() -> None:
     results = Path(__file__).parents[1] / "benchmarks" / "results"
     measured = "".join(file.read_text() for file in results.rglob("*.json"))
     for name in qualification.KNOWN:
         assert f'"name": "{name}"' in measured
-
-
-def test_a_report_reads_as_it_was_written(child: Child) -> None:
-    child(RIGHT)
-    verdict = qualify(GPU, "bf16", MODEL)
-    assert qualification.read_document(file_of(GPU, "bf16", MODEL), Verdict, ConfigError) == verdict
 
 
 def test_processes_that_want_the_same_take_turns(child: Child, started: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -147,12 +147,6 @@ def test_what_failed_is_left_to_pytorch_and_said(monkeypatch: pytest.MonkeyPatch
 # -- a backend's call --------------------------------------------------------------------------------------------------
 
 
-class WrongGeglu(OnCpu):
-    def _make_ops(self) -> Ops:
-        given = {"linear_geglu": PLAIN.linear_geglu} if "linear_geglu" in self._without else {}
-        return dataclasses.replace(PLAIN, linear_geglu=wrong_tile(PLAIN.linear_geglu), **given)  # type: ignore[arg-type]
-
-
 class WrongBatch(OnCpu):
     """Two observations together give the first one's actions twice."""
 
@@ -187,11 +181,6 @@ def test_a_right_call_is_compared_and_its_denoising_kernel_announced(monkeypatch
     assert ("a batch of two", "batch") in begun and begun[-1] == ("kernels", "")
 
 
-def test_a_wrong_operation_of_a_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    comparison, _ = checked("WrongGeglu", monkeypatch, {DENOISE: "not on a CPU"})
-    assert set(comparison.failed) == {"linear_geglu"}
-
-
 def test_a_batch_that_is_wrong_is_a_path_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Faulty, match="a batch's actions are off by") as fault:
         checked("WrongBatch", monkeypatch, {DENOISE: "not on a CPU"})
@@ -210,11 +199,8 @@ def test_a_shallow_model_has_every_size_but_the_depth(model: Network) -> None:
     assert differing <= {"vision", "vlm", "expert", "text", "expert_depth"}
     assert few.vision.depth == 4 and dataclasses.replace(few.vision, depth=model.vision.depth) == model.vision
     assert shallow(few) == few
-
-
-def test_half_as_many_layers_of_the_expert_stay_half_as_many() -> None:
     half: Any = shallow(dataclasses.replace(BASE.model, expert_depth=8))
-    assert (half.text.depth, half.expert_depth) == (4, 2)
+    assert (half.text.depth, half.expert_depth) == (4, 2), "half as many stay half as many"
 
 
 # -- stages ------------------------------------------------------------------------------------------------------------
@@ -236,17 +222,6 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> Subject:
 def events(subject: Subject) -> tuple[bool, list[Event]]:
     said: list[Event] = []
     return run.run(subject, said.append), said
-
-
-@pytest.mark.slow
-def test_a_backend_that_is_right_goes_through_all_stages(subject: Subject) -> None:
-    ended, said = events(subject)
-    assert ended and [one.stage.name for one in said if one.stage] == list(STAGES[:4])
-    figures = next(one.stage.figures for one in said if one.stage and one.stage.name == STAGES[2])
-    assert 0 < figures["denoise, error over bound"] <= 1 and 0 < figures["prefix, error over bound"] <= 1
-    (raced,) = (one for one in said if one.reason)
-    assert raced.reason == "right; pytorch 2.00 ms, and other 3.00 ms" and raced.memory == 5 and said[-1].done
-    assert qualification.excluded(CPU, "bf16", TWO_LAYERS.model) == {}
 
 
 @pytest.mark.slow
