@@ -60,7 +60,7 @@ def test_auto_takes_what_the_verdict_says(monkeypatch: pytest.MonkeyPatch) -> No
     assert name == "fused" and why.endswith("precision: right; 14 ms; without batch: it hangs")
     pretend(monkeypatch, {}, "NVIDIA L40S", verdict(taken="cuda_graph", reason="right; 24 ms, and cuda_graph 20 ms"))
     name, why = backends.choose(GPU)
-    assert name == "cuda_graph" and "not fused: qualified on this GPU: right; 24 ms, and cuda_graph 20 ms" in why
+    assert name == "cuda_graph" and "not fused: tested on this GPU: right; 24 ms, and cuda_graph 20 ms" in why
 
 
 def test_auto_takes_no_backend_that_lacks_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:

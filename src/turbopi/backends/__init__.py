@@ -227,7 +227,7 @@ def _untried(device: torch.device, precision: Precision, model: Network | None) 
     verdict = verdict_of(device, precision, model or ModelConfig())
     if verdict is None:
         return f"it isn't qualified on this GPU yet, which {COMMAND} does"
-    return f"qualified on this GPU: {verdict.summary}"
+    return f"tested on this GPU: {verdict.summary}"
 
 
 def qualified(device: torch.device, precision: Precision, model: Network, *, bar: bool = False) -> None:
