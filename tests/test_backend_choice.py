@@ -5,9 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tile_helpers import verdict
 
 from turbopi import backends
+from turbopi.backends import qualification
 from turbopi.backends.fused import FusedBackend
+from turbopi.backends.qualification import Verdict
 from turbopi.config import PRESETS, MemoryConfig
 from turbopi.models.smolvla.family import BASE
 from turbopi.support.errors import BackendUnavailable
@@ -15,8 +18,14 @@ from turbopi.support.errors import BackendUnavailable
 GPU = torch.device("cuda", 0)
 
 
-def pretend(monkeypatch: pytest.MonkeyPatch, missing: dict[str, str], capability: tuple[int, int] = (9, 0)) -> None:
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+def pretend(
+    monkeypatch: pytest.MonkeyPatch,
+    missing: dict[str, str],
+    name: str = "NVIDIA H200",
+    verdict: Verdict | None = None,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: name)
+    monkeypatch.setattr(qualification, "kept", lambda device, precision, model: verdict)
     monkeypatch.setattr(backends, "availability", lambda name, device: missing.get(name))
 
 
@@ -32,11 +41,26 @@ def test_auto_names_what_it_passed_over(monkeypatch: pytest.MonkeyPatch) -> None
     assert "not fused: Triton isn't installed; not cuda_graph: too old" in why
 
 
-def test_auto_takes_no_kernels_of_ours_on_a_gpu_they_were_never_run_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    pretend(monkeypatch, {}, capability=(8, 9))
+@pytest.mark.parametrize("gpu", ["NVIDIA GeForce RTX 4090", "NVIDIA H20", "NVIDIA H100 PCIe"])
+def test_auto_takes_no_kernels_of_ours_on_a_gpu_that_is_not_qualified(
+    gpu: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend(monkeypatch, {}, gpu)
     name, why = backends.choose(GPU)
     assert name == "cuda_graph"
-    assert "not fused: it was never run on compute capability 8.9; try it with backend='fused'" in why
+    assert "not fused: it isn't qualified on this GPU yet, which `turbopi doctor --qualify` does; try it with" in why
+    assert "it isn't qualified on this GPU yet" in backends.choose(GPU, "fp8")[1]
+
+
+def test_auto_takes_what_the_verdict_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(
+        monkeypatch, {}, "NVIDIA L40S", verdict(taken="fused", reason="right; 14 ms", excluded={"batch": "it hangs"})
+    )
+    name, why = backends.choose(GPU)
+    assert name == "fused" and why.endswith("precision: right; 14 ms; without batch: it hangs")
+    pretend(monkeypatch, {}, "NVIDIA L40S", verdict(taken="cuda_graph", reason="right; 24 ms, and cuda_graph 20 ms"))
+    name, why = backends.choose(GPU)
+    assert name == "cuda_graph" and "not fused: tested on this GPU: right; 24 ms, and cuda_graph 20 ms" in why
 
 
 def test_auto_takes_no_backend_that_lacks_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,6 +122,7 @@ def test_int8_runs_where_fp8_does_not(
     monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], kernels: str, reason: str | None
 ) -> None:
     monkeypatch.setenv("TURBOPI_KERNELS", kernels)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "NVIDIA H200")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: object())

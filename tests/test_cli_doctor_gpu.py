@@ -1,5 +1,6 @@
 """`turbopi doctor` on GPUs that aren't here: faked devices, and the backends' own answers about them."""
 
+import json
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -7,12 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from tile_helpers import tile_document
+from cli_helpers import refusal, turbopi
+from tile_helpers import tile_document, verdict
 
 from turbopi import backends
-from turbopi.backends import Precision, tuned_tiles
+from turbopi.backends import Precision, qualification, qualifying, tuned_tiles
+from turbopi.backends.qualification import Verdict
 from turbopi.bench.measured import measured_calls
-from turbopi.cli import gpu_checkups
+from turbopi.cli import doctor, gpu_checkups
 from turbopi.cli.checkup import Row
 from turbopi.support.errors import BackendUnavailable
 
@@ -57,6 +60,9 @@ def fake(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Fake:
         monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: properties)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
         monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: code)
+        monkeypatch.setattr(qualification, "KNOWN", ("NVIDIA Fake",) if capability == (9, 0) else ())
+        monkeypatch.setattr(qualification, "cache_folder", lambda: cache)
+        monkeypatch.setattr(qualification, "_driver", lambda: driver)
         monkeypatch.setattr(torch.version, "cuda", cuda)
         monkeypatch.setattr(gpu_checkups, "nvidia_smi", lambda: (driver, ["NVIDIA Fake"]))
         monkeypatch.setattr(gpu_checkups, "ptxas_version", lambda arch: ptxas)
@@ -111,7 +117,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
             assert row == Row("OK", row.name, f"doesn't run: {refused}")
         else:
             assert row.level == "OK" and row.found.startswith(f"{chosen}: ")
-            assert ("never run on compute capability" in row.found) == (capability != (9, 0))
+            assert ("isn't qualified on this GPU" in row.found) == (capability != (9, 0))
             took = measured_gb(chosen, precision)
             assert took is None or f"takes {took + gpu_checkups.CONTEXT_GB:.1f} GB" in row.found
 
@@ -119,7 +125,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
 def test_every_tier_but_the_small_ones_has_a_row(fake: Fake) -> None:
     fake((9, 0))
     reported = {name.removeprefix("GPU 0 ") for name in rows() if name.startswith("GPU 0 ")}
-    assert reported == {"tiles", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
+    assert reported == {"tiles", "known", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
 
 
 @pytest.mark.parametrize(
@@ -136,6 +142,49 @@ def test_a_missing_compiler_comes_with_its_command(fake: Fake, monkeypatch: pyte
     fake((9, 0))
     monkeypatch.setattr("shutil.which", lambda name: None)
     assert rows()["GPU 0 fp8"].fix == "apt-get install g++ python3-dev"
+
+
+# --- a GPU that no test ran on ---
+
+
+def qualify(monkeypatch: pytest.MonkeyPatch, found: Verdict, *options: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and JSON of `turbopi doctor --qualify` where the process finds that."""
+    monkeypatch.setattr("turbopi.cli.checkups.check_gpu", list)
+    monkeypatch.setattr(backends, "refusal", lambda *given: None)
+    monkeypatch.setattr(backends, "resolve_device", lambda device: torch.device("cuda", 0))
+    monkeypatch.setattr(doctor, "list_backends", lambda device, precision: {})
+    monkeypatch.setattr(qualifying, "_verdict", lambda *given: found)
+    monkeypatch.setattr(qualifying, "_attempt", lambda *given: qualifying._Run(finished=True))
+    result = turbopi("doctor", "--qualify", "--json", *options)
+    return result.exit_code, json.loads(result.stdout)
+
+
+def test_doctor_qualifies_once_and_by_force_again(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake((8, 9))
+    assert "isn't qualified yet" in rows()["GPU 0 known"].found
+    _, first = qualify(monkeypatch, verdict(reason="right; fused 20.00 ms"))
+    assert first["qualification"]["reason"] == "right; fused 20.00 ms" and Path(first["file"]).is_file()
+    _, second = qualify(monkeypatch, verdict(reason="other"))
+    assert second["qualification"]["reason"] == "right; fused 20.00 ms"
+    _, third = qualify(monkeypatch, verdict(reason="other"), "--force")
+    assert third["qualification"]["reason"] == "other"
+    row = rows()["GPU 0 known"]
+    assert row.level == "OK" and row.found.startswith("fused for pi05_base in bf16, qualified 2026-11-29: other; ")
+
+
+def test_doctor_says_what_to_do_about_a_fault(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake((8, 9))
+    _, document = qualify(monkeypatch, verdict(excluded={"denoise": "it hangs"}))
+    row = rows()["GPU 0 known"]
+    assert row.level == "WARN" and row.fix.endswith(
+        f"attach the file that `turbopi doctor --qualify` wrote: {document['file']}"
+    )
+    assert refusal(turbopi("doctor", "--force")) == "--force goes with --qualify"
+
+
+def test_a_known_gpu_is_said_to_be_one(fake: Fake) -> None:
+    fake((9, 0))
+    assert rows()["GPU 0 known"].level == "OK"
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------

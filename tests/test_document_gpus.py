@@ -1,6 +1,7 @@
 """docs/gpus.md says of each GPU what the backends, the checked-in results and the predictions say."""
 
 import json
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -8,14 +9,17 @@ import pytest
 import torch
 from compile_for_all.document import Compiled, CompiledForAll, written
 from doc_tables import gpus as tables
+from tile_helpers import verdict
 
 from turbopi import backends
+from turbopi.backends import qualification
 from turbopi.bench.gpus import find_gpu, published_gpus
 from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
 from turbopi.support.errors import BackendUnavailable
+from turbopi.support.reading import plain_document
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
@@ -40,6 +44,9 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
     gpu = find_gpu(key)
     row = cells(table(), gpu.name)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: gpu.capability)
+    named = [name for name in qualification.KNOWN if re.search(rf"\b{gpu.key}\b", name.lower())]
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: (*named, gpu.name)[0])
+    monkeypatch.setattr(qualification, "kept", lambda device, precision, model: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: object())
     monkeypatch.setattr("shutil.which", lambda name, *rest: f"/usr/bin/{name}")
     monkeypatch.setattr("turbopi.support.toolchain._missing_headers", lambda: None)
@@ -54,7 +61,7 @@ def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypat
             assert any(line.rstrip(" |").split("| ")[-1] in said for line in reasons)
         else:
             backends.check(chosen, device, precision)
-            assert row[precision] == f"`{chosen}`"
+            assert row[precision] == f"`{chosen}`" + tables.QUALIFIED * (not named)
 
 
 def test_every_gpu_asked_for_has_its_rows() -> None:
@@ -105,6 +112,23 @@ def test_cases_run_as_ptx_count_for_their_gpu_and_newer_ones(tmp_path: Path) -> 
     rows[2]["problem"] = "differs"
     (tmp_path / "h100_2026-11-27_ptx.json").write_text(json.dumps({"rows": rows}))
     assert cells(tables.gpus(tmp_path), "Jetson AGX Thor (T5000)")[head] == "2 of 3"
+
+
+def test_a_users_report_is_a_line(tmp_path: Path) -> None:
+    assert tables.gpu_reports(tmp_path) == ["No report is here yet."]
+    (tmp_path / "qualified").mkdir()
+    raced = {"fused": {"total": 24.123}, "cuda_graph": {"total": 31.0}}
+    reports = [
+        verdict(milliseconds=raced, excluded={"batch": "its error is 1"}),
+        verdict(precision="fp8", taken=None, failed=True, reason="its self-test failed: a | b"),
+    ]
+    for number, one in enumerate(reports):
+        (tmp_path / "qualified" / f"{number}.json").write_text(json.dumps(plain_document(one)))
+    about = "| NVIDIA GeForce RTX 4090 | 580.95.05 | pi05 |"
+    assert tables.gpu_reports(tmp_path)[2:] == [
+        f"{about} bf16 | 24.12 | 31.00 | fused | batch | 0.2.0 |",
+        f"{about} fp8 |  |  | nothing | its self-test failed: a / b | 0.2.0 |",
+    ]
 
 
 def test_predictions_are_of_the_backend_that_runs_there() -> None:

@@ -44,6 +44,7 @@ PRODUCT = tuple(
 HOST_ONLY = (
     *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.policy", "turbopi.support"),
     *("turbopi.recordings", "turbopi.verify.golden", "turbopi.realtime.running_chunk"),
+    *("turbopi.backends.qualification", "turbopi.backends.qualifying"),  # files, and a process that is watched
     "turbopi.backends.tensorrt",  # engines: TensorRT's own code
     *("turbopi.backends.onnx", "turbopi.backends.onnx.backend"),  # refuses every device but the CPU
 )

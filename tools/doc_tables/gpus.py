@@ -18,29 +18,37 @@ from compile_for_all.document import read_compiled
 from msgspec import structs
 
 from turbopi import backends
-from turbopi.backends import Precision
+from turbopi.backends import Precision, qualification
+from turbopi.backends.qualification import Verdict
 from turbopi.bench.gpus import GpuSpec, published_gpus
 from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import Prediction, predict
 from turbopi.bench.work import Job
 from turbopi.cli.predict import call_text
 from turbopi.config import ModelConfig
-from turbopi.support.errors import TurboPiError
+from turbopi.support.errors import ConfigError, TurboPiError
+from turbopi.support.reading import read_document
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TESTED = "*_gpu_check.json"
 COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json"  # the second of an H100 or H200; its newest counts
 DEVICE = torch.device("cuda", 0)
+RACED = ("fused", "cuda_graph")
+QUALIFIED = " *"  # behind what `auto` takes where it isn't qualified: then it may be `fused`
+REPORTS = "qualified/*.json"  # as users' machines wrote them
 TIERS: tuple[Precision, ...] = tuple(one for one in backends.PRECISIONS if one != "f32" and not one.endswith("-mlp"))
 
 
 @contextmanager
-def pretended(capability: tuple[int, int]) -> Iterator[None]:
-    """One GPU of that compute capability, with every package and compiler there: hardware alone decides."""
+def pretended(gpu: GpuSpec) -> Iterator[None]:
+    """One such GPU, with every package and compiler there: hardware alone decides."""
     found = lambda name, *rest: object()  # noqa: E731
     with (
         patch.object(torch.cuda, "is_available", lambda: True),
-        patch.object(torch.cuda, "get_device_capability", lambda device=None: capability),
+        patch.object(torch.cuda, "get_device_capability", lambda device=None: gpu.capability),
+        patch.object(qualification, "is_known", lambda device: is_known(gpu)),
+        patch.object(backends, "is_known", lambda device: is_known(gpu)),
+        patch.object(qualification, "kept", lambda device, precision, model: None),
         patch("importlib.util.find_spec", found),
         patch.object(shutil, "which", lambda name, *rest: f"/usr/bin/{name}"),
         patch("turbopi.support.toolchain._missing_headers", lambda: None),
@@ -48,10 +56,15 @@ def pretended(capability: tuple[int, int]) -> Iterator[None]:
         yield
 
 
+def is_known(gpu: GpuSpec) -> bool:
+    """Whether Turbo-Pi's own tests ran on it, so that `auto` takes `fused` without qualifying it."""
+    return any(gpu.key in name.lower().split() for name in qualification.KNOWN)
+
+
 def runs(gpu: GpuSpec) -> dict[str, str]:
-    """Precision -> the backend that `auto` takes on it; "no" where none runs."""
+    """Precision -> the backend that `auto` takes on it, before anybody qualifies it; "no" where none runs."""
     found: dict[str, str] = {}
-    with pretended(gpu.capability):
+    with pretended(gpu):
         for precision in TIERS:
             name = backends.choose(DEVICE, precision)[0]
             try:
@@ -63,18 +76,15 @@ def runs(gpu: GpuSpec) -> dict[str, str]:
 
 
 def refusals(gpu: GpuSpec) -> dict[str, str]:
-    """What isn't taken on a GPU, or refused -> why, in the backends' words."""
+    """What is refused on a GPU -> why, in the backends' words."""
     found = {}
-    with pretended(gpu.capability):
+    with pretended(gpu):
         for precision in TIERS:
-            name, why = backends.choose(DEVICE, precision)
+            name = backends.choose(DEVICE, precision)[0]
             try:
                 backends.check(name, DEVICE, precision)
             except TurboPiError as error:
                 found[f"{precision}: refused"] = str(error).partition(f" on {DEVICE}: ")[2] or str(error)
-                continue
-            if passed_over := re.search(r"\(not (\w+): (.*)\)$", why):
-                found[f"{precision}: not `{passed_over[1]}`"] = passed_over[2]
     return found
 
 
@@ -133,15 +143,33 @@ def gpus(results: Path = RESULTS) -> list[str]:
     heads = ["GPU", "compute capability", *TIERS, "run", "run as PTX on Hopper", "kernels compiled"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for gpu in published_gpus().values():
-        taken = runs(gpu)
-        cells = [gpu.name, gpu.compute_capability, *(taken[precision] for precision in TIERS)]
+        taken, known = runs(gpu), is_known(gpu)
+        cells = [gpu.name, gpu.compute_capability]
+        cells += [f"{taken[one]}{'' if known or taken[one] == 'no' else QUALIFIED}" for one in TIERS]
         cells += [was_run(gpu, results), ran_as_ptx(gpu, results), compiled_for(gpu, results)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
+def gpu_reports(results: Path = RESULTS) -> list[str]:
+    """What users' machines found out by qualifying themselves, a line a report."""
+    found = [read_document(file, Verdict, ConfigError) for file in results.glob(REPORTS)]
+    if not found:
+        return ["No report is here yet."]
+    heads = (
+        "| GPU | driver | model | precision | `fused` ms | `cuda_graph` ms | taken | excluded or failed | Turbo-Pi |"
+    )
+    lines = [heads, "|---|---|---|---|--:|--:|---|---|---|"]
+    for one in sorted(found, key=lambda one: (one.gpu, one.model, one.precision, one.date)):
+        times = [f"{one.milliseconds[name]['total']:.2f}" if name in one.milliseconds else "" for name in RACED]
+        wrong = "; ".join([*([one.reason] if one.failed else []), *one.excluded]).replace("|", "/")
+        about = [one.gpu, one.driver, one.model, one.precision, *times, one.taken or "nothing", wrong or "nothing"]
+        lines.append(f"| {' | '.join([*about, one.versions.get('turbopi', '')])} |")
+    return lines
+
+
 def gpu_refusals() -> list[str]:
-    """Why something doesn't run, or isn't taken, and on which compute capabilities."""
+    """Why something doesn't run, and on which compute capabilities."""
     by_reason: dict[tuple[str, str], list[str]] = {}
     for gpu in sorted(published_gpus().values(), key=lambda gpu: gpu.capability):
         for what, why in refusals(gpu).items():

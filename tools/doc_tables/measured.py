@@ -71,7 +71,7 @@ def measured(root: Path) -> str:
             if result.backend in source.kernels and _wanted(result):
                 call = _call(result, source)
                 calls[call.gpu, call.backend, call.precision, call.kernels, call.job] = call
-    lines = [json.dumps(plain_document(call)) for call in calls.values()]
+    lines = [json.dumps(plain_document(call), separators=(",", ":")) for call in calls.values()]
     return '{"calls": [\n' + ",\n".join(lines) + "\n]}\n"
 
 

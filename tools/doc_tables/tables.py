@@ -9,7 +9,7 @@ from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
 from doc_tables.fleet import sizing
-from doc_tables.gpus import gpu_predictions, gpu_refusals, gpus
+from doc_tables.gpus import gpu_predictions, gpu_refusals, gpu_reports, gpus
 from doc_tables.peers import peers, read_run
 from doc_tables.studies import few_steps, read_report, study
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
@@ -325,7 +325,10 @@ TABLES = {
     "small_policy": Table(_read_judged, small_policy),
     "small_policy_delays": Table(_read_judged, small_policy_delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
-    **{lines.__name__: Table(_read_nothing, lines) for lines in (sizing, gpus, gpu_refusals, gpu_predictions)},
+    **{
+        lines.__name__: Table(_read_nothing, lines)
+        for lines in (sizing, gpus, gpu_refusals, gpu_reports, gpu_predictions)
+    },
     "study": Table(read_report, study),
     "few_steps": Table(read_report, few_steps),
     "peers": Table(read_run, peers),

@@ -2,17 +2,20 @@
 distributions may add theirs: docs/extending.md.
 
 Nothing falls back: a backend that can't run raises BackendUnavailable with the reason. Only "auto" chooses, once, and
-says what it chose and why.
+says what it chose and why; on a GPU that Turbo-Pi's tests never ran on by the verdict of `qualification`.
 """
 
 import importlib
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
+from turbopi.backends import qualifying
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
-from turbopi.config import Network
+from turbopi.backends.qualification import COMMAND, Verdict, file_of, is_known, verdict_of
+from turbopi.config import ModelConfig, Network
 from turbopi.engine.graph import preparing
 from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization
@@ -125,7 +128,6 @@ _SPECS = (
     ),
 )
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
-_RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}  # Turbo-Pi's own
 
 
@@ -188,20 +190,26 @@ def _unavailable(cls: type[Backend], device: torch.device) -> str | None:
 def choose(device: torch.device, precision: Precision = "bf16", model: Network | None = None) -> tuple[str, str]:
     """The backend that "auto" stands for on a device in a precision, and why. model: None: one of Pi0 or Pi0.5."""
     if precision in TIERS:
-        untried = _untried("fused", device) if device.type == "cuda" else None
-        return "fused", f"auto: the fast one of those that run in {precision}" + (f"; it {untried}" if untried else "")
+        untried = _untried(device, precision, model) if device.type == "cuda" else None
+        return "fused", f"auto: the fast one of those that run in {precision}" + (f"; {untried}" if untried else "")
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []
     for name in _FASTEST_FIRST:
         if precision not in precisions(name):
             continue
-        reason = availability(name, device) or _unproven(name, device)
+        reason, qualified = availability(name, device), ""
         if reason is None and model is not None:
             reason = _refuses(class_for(name, model), model, precision)
+        if reason is None and name == "fused" and not is_known(device):
+            verdict = verdict_of(device, precision, model or ModelConfig())
+            if verdict is None or verdict.taken != name:
+                reason = f"{_untried(device, precision, model)}; try it with backend='fused'"
+            else:
+                qualified = f": {verdict.summary}"
         if reason is None:
             skipped = f" ({'; '.join(reasons)})" if reasons else ""
-            return name, f"auto: the fastest backend for this GPU and precision{skipped}"
+            return name, f"auto: the fastest backend for this GPU and precision{qualified}{skipped}"
         reasons.append(f"not {name}: {reason}")
     return "pytorch", f"auto: {'; '.join(reasons)}"
 
@@ -212,24 +220,57 @@ def _refuses(cls: type[Backend], model: Network, precision: Precision) -> str | 
     return f"it runs {family_of(model).label} in {' or '.join(cls.precisions)}"
 
 
-def _unproven(name: str, device: torch.device) -> str | None:
-    """Why "auto" doesn't take a backend that could run on the device."""
-    untried = _untried(name, device)
-    return None if untried is None else f"it {untried}; try it with backend={name!r}"
-
-
-def _untried(name: str, device: torch.device) -> str | None:
-    """What a backend wasn't run on, in words; None if it was."""
-    major, minor = torch.cuda.get_device_capability(device)
-    if major in _RUN_ON.get(name, (major,)):
+def _untried(device: torch.device, precision: Precision, model: Network | None) -> str | None:
+    """What is known of `fused` on a GPU that Turbo-Pi's tests never ran on; None if they did."""
+    if is_known(device):
         return None
-    return f"was never run on compute capability {major}.{minor}"
+    verdict = verdict_of(device, precision, model or ModelConfig())
+    if verdict is None:
+        return f"it isn't qualified on this GPU yet, which {COMMAND} does"
+    return f"tested on this GPU: {verdict.summary}"
+
+
+def qualified(device: torch.device, precision: Precision, model: Network, *, bar: bool = False) -> None:
+    """Where "auto" could take `fused` on a GPU that Turbo-Pi's tests never ran on, find out once whether it should.
+
+    Raises BackendUnavailable where `fused` fails in a precision that no other backend has.
+    """
+    if device.type != "cuda" or is_known(device) or refusal("fused", device, precision, model) is not None:
+        return
+    verdict = verdict_of(device, precision, model)
+    if verdict is None or 0 < verdict.unfinished < qualifying.TURNS:
+        what = f"backend 'fused' for {family_of(model).label} in {precision} on {torch.cuda.get_device_name(device)}"
+        with qualifying.shown(bar, what, qualifying.SECONDS) as tell:
+            verdict = qualifying.qualify(device, precision, model, tell=tell)
+    check_verdict(verdict, file_of(device, precision, model))
+
+
+def check_verdict(verdict: Verdict, file: Path) -> None:
+    """Raise BackendUnavailable if nothing is to run in its precision."""
+    if verdict.taken is None:
+        raise BackendUnavailable(
+            f"{verdict.precision} can't run on {verdict.gpu}: {verdict.summary}; take 'bf16', and "
+            f"{verdict.issue(file)}; backend 'fused' by name runs it all the same"
+        )
+
+
+def refusal(name: str, device: torch.device, precision: Precision, model: Network) -> str | None:
+    """Why a backend can't run a model on a device in a precision, whatever was qualified; None if it can."""
+    cls = class_for(name, model)
+    return _unavailable(cls, device) or cls.unavailable_in(device, precision) or _refuses(cls, model, precision)
+
+
+def checked_precision(precision: str) -> Precision:
+    """Raises ConfigError for one that doesn't exist."""
+    for one in PRECISIONS:
+        if one == precision:
+            return one
+    raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
 
 
 def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
-    if precision not in PRECISIONS:
-        raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
+    checked_precision(precision)
     cls = class_of(name)
     if precision not in cls.precisions:
         raise ConfigError(f"backend {name!r} runs in {' or '.join(cls.precisions)}, not in {precision!r}")

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -20,6 +21,7 @@ from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.device_lost import ADVICE
 from turbopi.backends.expert_store import ExpertStore, Layers, User, layer_on
+from turbopi.backends.qualification import DENOISE, excluded
 from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.engine.call import CallShape
 from turbopi.engine.loops import Loop
@@ -59,6 +61,7 @@ class FusedBackend(CudaGraphBackend):
     # where one guided call alone goes forward in the denoising kernel; of two estimated
     JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
+    _without: Mapping[str, str] = MappingProxyType({})  # what failed its self-test on this GPU, and how
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
@@ -66,6 +69,7 @@ class FusedBackend(CudaGraphBackend):
         given = self._quantization
         self._plan = None if given is None else given.plan(self.config, self.precision)
         self._kernels: dict[User, Any] = {}  # denoising kernels, or why one is refused: operations denoise then
+        self._without = excluded(self.device, self.precision, self.config)
         super().load_weights(load)
 
     @classmethod
@@ -101,6 +105,8 @@ class FusedBackend(CudaGraphBackend):
 
     def describe(self) -> dict[str, Any]:
         described = super().describe() | {"tiles": self._tiles.about}
+        if self._without:
+            described["excluded"] = dict(self._without)
         if self._plan is not None and self._quantization is not None:
             numbers = self._plan.format.name
             described[numbers] = self._quantization.describe(self._plan)
@@ -152,6 +158,8 @@ class FusedBackend(CudaGraphBackend):
         """What `make` makes, once; None, with the reason noted, where it raises BackendUnavailable."""
         if user not in self._kernels:
             try:
+                if (failed := self._without.get(DENOISE)) is not None:
+                    raise BackendUnavailable(f"it failed its self-test on this GPU: {failed}")
                 self._kernels[user] = make()
             except BackendUnavailable as e:
                 logger.info("operations in place of a denoising kernel of %s (%s): %s", user.loop, user.what, e)
@@ -194,8 +202,8 @@ class FusedBackend(CudaGraphBackend):
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
 
-        self._on_hopper, self._tiles = hopper_kernels(self.device), tiles_of(self.device)
-        return fused_ops(self.device, self._tiles.table)
+        self._on_hopper, self._tiles = hopper_kernels(self.device, self._without), tiles_of(self.device)
+        return fused_ops(self.device, self._tiles.table, self._without)
 
     @property
     def _times_by_token(self) -> bool:

@@ -1,6 +1,7 @@
 """Backend `fused` for SmolVLA: its stages with kernels of our own (engine/smolvla.py), a call's steps in one launch.
 
-Steps of a conditioned call, which that kernel doesn't take, run as in `cuda_graph`: the reference's, captured.
+Steps of a conditioned call, which that kernel doesn't take, run as in `cuda_graph`: the reference's, captured. So do
+all where that kernel failed its self-test.
 """
 
 from dataclasses import dataclass
@@ -12,10 +13,12 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.captured import Answer, CapturedBackend, Graphs
 from turbopi.backends.fused import FusedBackend
+from turbopi.backends.qualification import DENOISE, excluded
 from turbopi.backends.tuned_tiles import tiles_of
 from turbopi.config import Network
 from turbopi.engine import smolvla
 from turbopi.engine.graph import HEAD, Graph, Mark, building
+from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
 from turbopi.models.observation import Observation
@@ -63,13 +66,22 @@ class FusedSmolVLABackend(CapturedBackend):
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(load)
-        self._tiles = tiles_of(self.device)
-        ops = fused_ops(self.device, self._tiles.table)
+        self._tiles, self._without = tiles_of(self.device), excluded(self.device, self.precision, self.config)
+        ops = self._make_ops()
         self._tower = smolvla.Vision.pack(self.model, ops, torch.bfloat16)
         self._prefix = smolvla.Prefix.pack(self.model, ops, torch.bfloat16)
         self._prefix_of = self._prefix_stage
         self._expert = smolvla.Expert.pack(self.model)
         self._origin = ops.origin
+
+    def _make_ops(self) -> Ops:
+        return fused_ops(self.device, self._tiles.table, self._without)
+
+    def _make_denoiser(self, num_steps: int, **sizes: Any) -> PortableDenoiser:
+        return self._expert.denoiser(num_steps, device=self.device, **sizes)
+
+    def _by_step(self, conditioning: Conditioning | None) -> bool:
+        return DENOISE in self._without or (conditioning is not None and conditioning.form != "plain")
 
     def warmup(
         self,
@@ -82,15 +94,18 @@ class FusedSmolVLABackend(CapturedBackend):
         conditioning: Conditioning | None = None,
     ) -> None:
         graphs, actions = self._captured(int(observation.image_mask[0].sum())), horizon or self.config.action_horizon
-        self._loop(graphs, actions, num_steps)
-        if conditioning is not None and conditioning.form != "plain":
-            self._step(graphs, actions, by_action=conditioning.form == "tokens")
+        if DENOISE not in self._without:
+            self._loop(graphs, actions, num_steps)
+        if self._by_step(conditioning):
+            self._step(graphs, actions, by_action=conditioning is not None and conditioning.form == "tokens")
 
     def describe(self) -> dict[str, Any]:
         loops = sorted({f"{steps} steps, H={h}" for graphs in self._graphs.values() for h, steps in graphs.loops})
         denoising = {"one portable CUDA kernel": loops, "a captured step at a time": ["conditioned calls"]}
+        if DENOISE in self._without:
+            denoising = {"a captured step at a time": ["all calls"]}
         made = {"operations": dict(self._origin), "tiles": self._tiles.about, "denoising": denoising}
-        return super().describe() | made
+        return super().describe() | made | ({"excluded": dict(self._without)} if self._without else {})
 
     def _vision(self, observation: Observation, mark: Mark) -> Tensor:
         return self._tower(observation.images[0], lambda: mark(HEAD))
@@ -118,7 +133,7 @@ class FusedSmolVLABackend(CapturedBackend):
         conditioning: Conditioning | None,
         keep: bool,
     ) -> Answer:
-        if conditioning is not None and conditioning.form != "plain":
+        if self._by_step(conditioning):
             return super()._denoise(graphs, cameras, x_1, num_steps, conditioning, keep)
         horizon = x_1.shape[1]
         if self.strict and (horizon, num_steps) not in graphs.loops:
@@ -136,7 +151,7 @@ class FusedSmolVLABackend(CapturedBackend):
             x_t, v_t = noise.new_zeros(num_steps + 1, *noise.shape), noise.new_zeros(num_steps, *noise.shape)
             rows = attended.keys.shape[2]
             with building(self.device), torch.no_grad():
-                kernel = self._expert.denoiser(num_steps, cache_rows=rows, suffix=horizon, device=self.device)
+                kernel = self._make_denoiser(num_steps, cache_rows=rows, suffix=horizon)
 
                 def run(mark: Mark) -> None:
                     kernel.launch(noise, attended.keys, attended.values, attended.length, x_t, v_t)

@@ -47,7 +47,7 @@ _Size = Annotated[int, Meta(ge=1)]
 _Microseconds = Annotated[float, Meta(gt=0)]
 
 
-class TunedTile(Struct, frozen=True, kw_only=True):
+class TunedTile(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The fastest tile of one operation. Sizes and tiles: see `kernels.tile_table`.
 
     Microseconds are of the operation with the norms around it; of the expert's in a batch of its whole layer.
@@ -62,7 +62,7 @@ class TunedTile(Struct, frozen=True, kw_only=True):
     inner: _Size
     tile: dict[str, int]
     microseconds: _Microseconds
-    usual: dict[str, int]  # what runs without this file
+    usual: dict[str, int] | None = None  # what runs without this file; None: the same
     usual_microseconds: _Microseconds
 
     @property
@@ -233,7 +233,7 @@ def read_tile_file(file: Path) -> TileFile:
         if document.fingerprints.get(one.kernels) != fingerprint(one.kernels):
             continue
         for field in ("tile", "usual"):
-            knobs: Knobs = getattr(one, field)
+            knobs: Knobs = getattr(one, field) or one.tile
             if (why := why_not(one.key, knobs, (int(major), int(minor)))) is not None:
                 raise ConfigError(f"{file}: tiles[{i}].{field} is {dict(knobs)}: {why}")
     return document
@@ -243,10 +243,10 @@ def write_tile_file(document: TileFile, file: Path) -> None:
     """Whole or not at all, a tile on a line. Raises OutputError if it can't be written."""
     make_folder(file)
     about = plain_document(document)
-    tiles = ",\n  ".join(json.dumps(plain_document(tile)) for tile in document.tiles)
+    tiles = ",\n".join(json.dumps(plain_document(tile), separators=(",", ":")) for tile in document.tiles)
     del about["tiles"]
     begin = json.dumps(about, indent=1).removesuffix("\n}")
-    write_whole(file, f'{begin},\n "tiles": [\n  {tiles}\n ]\n}}\n')
+    write_whole(file, f'{begin},\n "tiles": [\n{tiles}\n]\n}}\n')
 
 
 def knobs_text(knobs: Knobs) -> str:

@@ -7,7 +7,7 @@ from rich.markup import escape
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
-from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.errors import BackendUnavailable
 
 DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
 PrecisionOption = Annotated[
@@ -30,12 +30,11 @@ def list_backends(device: str, precision: str) -> dict[str, Any]:
     from turbopi import backends as registry
 
     resolved = registry.resolve_device(device)
-    if precision not in registry.PRECISIONS:
-        raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
-    chosen, why = registry.choose(resolved, precision)
+    tier = registry.checked_precision(precision)
+    chosen, why = registry.choose(resolved, tier)
     why = as_typed(why)
     try:
-        registry.check(chosen, resolved, precision)
+        registry.check(chosen, resolved, tier)
         runs = True
     except BackendUnavailable as error:
         why, runs = f"auto can't run in {precision} here: {error}", False

@@ -1,5 +1,6 @@
 """What a policy will offer, told from its configuration and backend before minutes of loading its weights."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     model, name = checkpoint.config.model, fitting.backend
     if name == "auto":
+        backends.qualified(device, precision, model, bar=sys.stderr.isatty())  # type: ignore[arg-type]
         name = backends.choose(device, precision, model)[0]  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
     cls = backends.class_for(name, model)

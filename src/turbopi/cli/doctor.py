@@ -1,13 +1,15 @@
 """`turbopi doctor`."""
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from turbopi.cli.backends import DeviceOption, PrecisionOption, list_backends, show_backends
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
+from turbopi.support.errors import BackendUnavailable, ConfigError
+from turbopi.support.reading import plain_document
 
 STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
 
@@ -19,6 +21,8 @@ STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
         "turbopi doctor --checkpoint checkpoints/pi05_libero --config pi05_libero",
         "turbopi doctor --port 8001 --json",
         "turbopi doctor --device cpu --precision fp8",
+        "turbopi doctor --qualify",
+        "turbopi doctor --qualify --checkpoint checkpoints/mine --precision fp8",
     ),
 )
 def doctor(
@@ -36,15 +40,27 @@ def doctor(
     ] = 8000,
     device: DeviceOption = "auto",
     precision: PrecisionOption = "bf16",
+    qualify: Annotated[
+        bool,
+        typer.Option(
+            "--qualify", help="Also find out whether `fused` is right and fast on this GPU, unless that is known."
+        ),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="With --qualify: though it is known.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Check this machine: what Turbo-Pi needs, what is there, how to mend it, and which backends run here.
 
     A warning is about something you may not need; exit code 1 says that something failed. No GPU is a warning.
+    --qualify takes the model of --checkpoint, else pi05_base's sizes, and up to ten minutes; `auto` does the same by
+    itself, in one.
     """
     output = Output(as_json)
     from turbopi.cli.checkups import examine
 
+    if force and not qualify:
+        raise ConfigError("--force goes with --qualify")
+    verdict = run_qualification(checkpoint, config, device, precision, force, output) if qualify else {}
     rows = list(examine(checkpoint=checkpoint, config=config, tokenizer=tokenizer, port=port))
     works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
     found = list_backends(device, precision) if works else {}
@@ -58,6 +74,36 @@ def doctor(
     if found:
         show_backends(found, output)
     output.line(summary, STYLES["FAIL" if counts["FAIL"] else "OK"])
-    output.document({"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows], **found})
+    output.document({"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows], **found, **verdict})
     if counts["FAIL"]:
         raise typer.Exit(CHECK_FAILED)
+
+
+def run_qualification(
+    checkpoint: str | None, config: str | None, device: str, precision: str, force: bool, output: Output
+) -> dict[str, Any]:
+    """The verdict on `fused` on a GPU, and its file, said and as JSON values. Raises BackendUnavailable without one."""
+    from turbopi import backends
+    from turbopi.backends import qualification, qualifying
+    from turbopi.checkpoint import open_checkpoint
+    from turbopi.config import ModelConfig, Network
+
+    model: Network = ModelConfig()
+    if checkpoint is not None:
+        model = open_checkpoint(checkpoint, "auto" if config is None else config).config.model
+    resolved, tier = backends.resolve_device(device), backends.checked_precision(precision)
+    if (why := backends.refusal("fused", resolved, tier, model)) is not None:
+        raise BackendUnavailable(f"there is nothing to qualify: {why}")
+    verdict = None if force else qualification.kept(resolved, tier, model)
+    if verdict is None or verdict.unfinished:
+        seconds = qualifying.PATIENT_SECONDS
+        with qualifying.shown(output.shows_progress, f"backend 'fused' in {tier}", seconds) as tell:
+            verdict = qualifying.qualify(resolved, tier, model, seconds=seconds, tell=tell)
+    file = qualification.file_of(resolved, tier, model)
+    for stage in verdict.stages:
+        output.line(f"{stage.name}: {stage.text} ({stage.seconds:.1f} s)")
+    output.line(f"{verdict.gpu}, {tier}: {verdict.taken or 'nothing'} is taken: {verdict.summary}", "bold")
+    output.line(f"written: {file} ({verdict.seconds:.0f} s)")
+    if (todo := verdict.issue(file)) is not None:
+        output.line(todo, "yellow")
+    return {"qualification": plain_document(verdict), "file": file}

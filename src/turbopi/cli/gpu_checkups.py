@@ -126,6 +126,7 @@ def what_runs(index: int, capability: tuple[int, int], memory_gb: float) -> Iter
         yield judge_precision(f"GPU {index} {tier}", device, tier, memory_gb, fitting)
     if backends.availability("fused", device) is None:
         yield judge_tiles(f"GPU {index} tiles", device)
+        yield judge_qualified(f"GPU {index} known", device)
 
 
 def judge_precision(name: str, device: Any, precision: Any, memory_gb: float, fitting: Mapping[str, float]) -> Row:
@@ -165,6 +166,23 @@ def judge_tiles(name: str, device: Any) -> Row:
         return Row("WARN", name, as_typed("; ".join(tiles.unused)), "turbopi tune")
     found = f"{tiles.about}, but TURBOPI_TUNED=off has them ignored" if off and len(tiles.table) else tiles.about
     return Row("OK", name, found if len(tiles.table) else f"{found}; `turbopi tune` measures")
+
+
+def judge_qualified(name: str, device: Any) -> Row:
+    """Whether Turbo-Pi's tests ran on such a GPU, or what qualifying it said, of the full-size model."""
+    from turbopi.backends import qualification
+    from turbopi.config import ModelConfig
+
+    if qualification.is_known(device):
+        return Row("OK", name, "Turbo-Pi's own tests ran on such a GPU")
+    verdict = qualification.kept(device, "bf16", ModelConfig())
+    if verdict is None:
+        fix = "turbopi doctor --qualify (the first policy does it, too, in a minute)"
+        return Row("WARN", name, "Turbo-Pi's tests never ran on such a GPU, and it isn't qualified yet", fix)
+    file = qualification.file_of(device, "bf16", ModelConfig())
+    found = f"{verdict.taken} for pi05_base in bf16, qualified {verdict.date}: {verdict.summary}; {file}"
+    fix = verdict.issue(file) or ("turbopi doctor --qualify" if verdict.unfinished else "")
+    return Row("WARN" if fix else "OK", name, as_typed(found), fix)
 
 
 def needed_gb(device: Any, precision: Any) -> float | None:

@@ -105,7 +105,7 @@ def plan(
 
 def _untried(table: "BatchTable") -> str | None:
     """Why `auto` wouldn't run this there; None if it would."""
-    from turbopi.backends import _RUN_ON
+    from turbopi.backends.qualification import KNOWN
     from turbopi.bench.gpus import find_gpu
     from turbopi.quantization.plan import TIERS
 
@@ -113,10 +113,10 @@ def _untried(table: "BatchTable") -> str | None:
         return None
 
     gpu = find_gpu(table.gpu)
-    if gpu.capability[0] in _RUN_ON.get(table.backend, gpu.capability[:1]):
+    if table.backend != "fused" or any(gpu.key in name.lower().split() for name in KNOWN):
         return None
     return (
-        f"{table.backend} was never run on a {gpu.name}, and `auto` doesn't take it there. Measure yours with "
+        f"{table.backend} was never run on a {gpu.name}, where `auto` qualifies it first. Measure yours with "
         f"`turbopi bench --backends {table.backend} --horizons {table.job.horizon} --batch 1,2,4,8`, then give --times"
     )
 

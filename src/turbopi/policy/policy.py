@@ -19,7 +19,6 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig, Solver, TimeGrid, memory_of
-from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.reference import FloatPrecision
@@ -63,7 +62,8 @@ class UnifiedPolicy:
         checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or an open `Checkpoint`.
         config: what no checkpoint records: a preset's name, a .json, a PolicyConfig, or "auto" for LeRobot's own config
             or the `turbopi.json` beside the weights.
-        backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`).
+        backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`), and
+            qualifies a GPU that it doesn't know, once, in at most a minute (docs/gpus.md).
         precision: "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8" (docs/quantization.md).
         quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
         num_denoising_steps: evaluations of the action expert in a call. None: the config's.
@@ -118,8 +118,6 @@ class UnifiedPolicy:
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
         self.config, model = checkpoint.config, checkpoint.config.model
-        if backend == "auto" and not family_of(model).planned:
-            name, why = backends.choose(self._device, precision, model)
         self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
         prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         reader = reader_of(checkpoint, prompt_tokenizer)
@@ -144,6 +142,9 @@ class UnifiedPolicy:
 
         calibration = for_policy(quantization, precision, checkpoint)
         self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
+        if backend == "auto":  # when all that was given is known to be good
+            backends.qualified(self._device, precision, model, bar=progress)
+            name, why = backends.choose(self._device, precision, model)
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(

@@ -127,7 +127,7 @@ def tuned_tile(one: Measured) -> TunedTile:
         inner=key.inner,
         tile=dict(raced.best.knobs),
         microseconds=round(raced.best.microseconds, 3),
-        usual=dict(raced.usual.knobs),
+        usual=None if raced.usual.knobs == raced.best.knobs else dict(raced.usual.knobs),
         usual_microseconds=round(raced.usual.microseconds, 3),
     )
 
