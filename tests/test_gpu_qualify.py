@@ -1,6 +1,7 @@
 """A GPU that is said to be unknown qualifies itself, and survives every planted fault: tests/qualify_faults.py."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,7 @@ TIMES_UP_NEVER = 600.0  # seconds: the tests' machine may compile for others at 
 EXCLUDED = {  # by planted fault
     "wrong_tile": "vision_attention",
     "barrier": DENOISE,
-    "gives_up": DENOISE,
     "hangs": DENOISE,
-    "does_not_compile": DENOISE,
 }
 
 
@@ -47,7 +46,8 @@ def few_layers(base: PolicyConfig, **sizes: Any) -> Checkpoint:
 def unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
     monkeypatch.setenv(qualification.UNKNOWN_VARIABLE, "1")
     monkeypatch.setenv(qualifying.DOUBLE_VARIABLE, qualify_faults.__name__)
-    monkeypatch.setenv("PYTHONPATH", f"{Path(__file__).parent}:{Path(qualification.__file__).parents[2]}")
+    paths = [str(Path(__file__).parent), str(Path(qualification.__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(qualifying, "SECONDS", TIMES_UP_NEVER)
     return monkeypatch
@@ -69,7 +69,7 @@ def is_right(policy: UnifiedPolicy, checkpoint: Checkpoint) -> bool:
 
 @pytest.mark.parametrize(
     ("name", "kernels"),
-    [("pi05_base", "auto"), ("pi05_base", "portable"), ("pi0_base", "portable"), ("smolvla_base", "auto")],
+    [("pi05_base", "portable"), ("smolvla_base", "auto")],
 )
 def test_on_a_sound_gpu_nothing_is_found_wrong(name: str, kernels: str, unknown: pytest.MonkeyPatch) -> None:
     unknown.setenv("TURBOPI_KERNELS", kernels)
@@ -100,8 +100,7 @@ def test_every_planted_fault_ends_in_a_policy_that_works(
     elif fault == "out_of_memory":
         assert (verdict.taken, verdict.failed) == ("cuda_graph", False) and "memory isn't enough" in verdict.reason
     else:
-        noted = {"room_for_one": "one after the other", "slow_clock": "times varied"}[fault]
-        assert noted in verdict.reason and verdict.taken is not None
+        assert "times varied" in verdict.reason and verdict.taken is not None
     assert policy.metadata["backend"] == verdict.taken and is_right(policy, checkpoint)
 
 
