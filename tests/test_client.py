@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import websockets.sync.server
-from serve_fakes import NO_CHUNKS
+from serve_fakes import NO_CHUNKS, wait_for
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection
 
 from turbopi.evaluate.sources import RemotePolicy
 from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
@@ -37,7 +36,7 @@ class Echo:
 @contextmanager
 def _instead_of_receiving(monkeypatch: pytest.MonkeyPatch, what: Any) -> Iterator[None]:
     with monkeypatch.context() as patch:
-        patch.setattr(ClientConnection, "recv", what)
+        patch.setattr("turbopi.realtime.policy_socket._Stream.receive", what)
         yield
 
 
@@ -241,6 +240,45 @@ def test_a_proxy_in_the_environment_is_not_asked(
     monkeypatch.setenv(variable, "http://127.0.0.1:9")  # where nobody listens
     with running(Echo()) as server:
         connect(server.port).close()
+
+
+def test_a_client_that_does_not_call_answers_pings_and_the_servers_goodbye() -> None:
+    ponged, left = threading.Event(), threading.Event()
+
+    def handle(connection: Any) -> None:
+        connection.send(pack({}))
+        if connection.ping().wait(60):
+            ponged.set()
+        connection.send(pack({"actions": np.ones((1, 1))}))
+        connection.close()  # waits for the client's
+        left.set()
+
+    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None, close_timeout=600) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
+            assert ponged.wait(60) and left.wait(60)
+            with pytest.raises(ServerLost, match="went away"):
+                client.infer({})
+        server.shutdown()
+        thread.join()
+
+
+def test_the_threads_of_a_client_end_with_it() -> None:
+    def threads() -> list[threading.Thread]:
+        return [one for one in threading.enumerate() if one.name == "turbopi-deadline" and one not in before]
+
+    before = threading.enumerate()
+    with running(Echo()) as server:
+        clients = [RealTimeClient("127.0.0.1", server.port) for _ in range(3)]
+        for client in clients:
+            client.infer({"place": 1})
+        assert len(threads()) == 3
+        clients[0].close()
+        wait_for(lambda: len(threads()) == 2)
+    wait_for(lambda: not threads())  # the server has closed the others
+    with pytest.raises(ServerLost, match="went away"):
+        clients[1].infer({"place": 1})
 
 
 # --- answers ----------------------------------------------------------------------------------------------------------

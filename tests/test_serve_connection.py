@@ -2,11 +2,15 @@
 how fast the machine is."""
 
 import asyncio
+import contextlib
 import itertools
 import logging
+import os
 import random
+import socket
 import struct
-from collections.abc import Awaitable, Callable
+import threading
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import pytest
@@ -105,6 +109,9 @@ class Transport(asyncio.Transport):
 
     def write_eof(self) -> None:
         pass
+
+    def get_write_buffer_size(self) -> int:
+        return self.unsent
 
     def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
         pass
@@ -736,5 +743,149 @@ def test_a_client_that_is_held_back_is_not_cut_for_its_silence_and_a_dead_one_is
         while client.closed_with is None:
             await asyncio.sleep(0.001)
         assert client.closed_with == (1011, "keepalive ping timeout")
+
+    run(test)
+
+
+# --- at once, and from other threads ----------------------------------------------------------------------------------
+
+
+class SlotsOfOne:
+    """Shared memory that holds one message, whatever is asked for."""
+
+    def __init__(self, message: bytes) -> None:
+        self._message = message
+
+    def message(self, received: bytes) -> bytes | None:
+        return self._message if received == b"\xc1slot!" else None
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_message_in_shared_memory_costs_what_it_costs_in_the_socket() -> None:
+    async def test(server: Server) -> None:
+        message, levels = camera_images(0), []
+        for sent in (frame(message), frame(b"\xc1slot!")):
+            client = await server.client()
+            client.connection._slots = SlotsOfOne(message)  # type: ignore[assignment]
+            client.send(sent)
+            levels.append((client.connection._credit._level, client.connection._unanswered[0].work))
+            assert await client.receive() == message
+        assert levels[0] == pytest.approx(levels[1], abs=0.01)  # but for the few bytes that say where it is
+
+    run(test)
+
+
+@pytest.mark.parametrize("kind", ["one frame", "two frames", "text", "a ping before"])
+def test_a_message_is_taken_in_the_callback_that_brings_it_if_it_is_one_frame(kind: str) -> None:
+    data = {
+        "one frame": frame(b"one"),
+        "two frames": frame(b"o", final=False) + frame(b"ne", CONTINUED),
+        "text": frame(b"one", 1),
+        "a ping before": frame(b"", PING) + frame(b"one"),
+    }[kind]
+
+    async def test(server: Server) -> None:
+        client, taken, done = await server.client(), list[bytes](), asyncio.get_running_loop().create_future()
+
+        def take(message: bytes) -> asyncio.Future[Any]:
+            taken.append(message)
+            return done
+
+        receiving = asyncio.ensure_future(client.connection.recv_taken(take))
+        await asyncio.sleep(0)
+        client.send(data + frame(b"two"))
+        at_once = kind in ("one frame", "a ping before")
+        assert taken == ([b"one"] if at_once else [])  # once: the next message waits for its turn
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert receiving.done() is not at_once
+        done.set_result(None)
+        assert await receiving == ("one" if kind == "text" else b"one")
+        assert await client.connection.recv_taken(take) == b"two"
+        assert len(taken) == at_once
+
+    run(test)
+
+
+def test_who_waits_for_a_taken_message_hears_of_the_connections_end() -> None:
+    async def test(server: Server) -> None:
+        for sends in (True, False):
+            client = await server.client()
+            never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+            def take(message: bytes, never: asyncio.Future[None] = never) -> asyncio.Future[None]:
+                return never
+
+            receiving = asyncio.ensure_future(client.connection.recv_taken(take))
+            await asyncio.sleep(0)
+            if sends:
+                client.send(frame(b"one"))
+            client.transport.abort()
+            with pytest.raises(ConnectionClosed):
+                await asyncio.wait_for(receiving, 30)
+            never.cancel()
+
+    run(test)
+
+
+@contextlib.contextmanager
+def written_to(client: Client, *, takes: int | None = None) -> Iterator[socket.socket]:
+    """The other end of a socket that a connection may write to, of which so many bytes are taken at once."""
+    near, far = socket.socketpair()
+    client.connection._descriptor = near.fileno()
+    near.setblocking(False)
+    if takes is not None:
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, takes)
+    with near, far:
+        yield far
+
+
+def test_an_answer_sent_at_once_is_a_frame_like_any_other() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        with written_to(client) as far:
+            thread = threading.Thread(target=lambda: client.connection.send_at_once(b"x" * 300))
+            thread.start()
+            thread.join()
+            assert far.recv(1000) == b"\x82\x7e\x01\x2c" + b"x" * 300
+        assert not client.transport.written
+
+    run(test)
+
+
+def test_what_the_socket_does_not_take_follows_before_anything_else() -> None:
+    async def test(server: Server) -> None:
+        client, message = await server.client(), camera_images(0, 2_000_000)
+        with written_to(client, takes=10_000) as far:
+            assert client.connection.send_at_once(message)
+            assert not client.connection.send_at_once(b"second")  # behind it
+            first = far.recv(2_000_000)
+            await client.connection.ping(b"later")
+        written = client.transport.written
+        assert first + written == b"\x82\x7f" + len(message).to_bytes(8, "big") + message + b"\x89\x05later"
+
+    run(test)
+
+
+@pytest.mark.parametrize("why", ["closing", "lost", "writes are pending", "the socket is full", "the client has left"])
+def test_what_cannot_be_sent_at_once_is_left_to_the_event_loop(why: str) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        with written_to(client) as far:
+            if why == "closing":
+                client.connection.protocol.send_close(1001)
+            elif why == "lost":
+                client.connection.connection_lost(None)
+            elif why == "writes are pending":
+                client.transport.unsent = 1
+            elif why == "the client has left":
+                far.close()
+            else:
+                with contextlib.suppress(BlockingIOError):
+                    while True:
+                        os.write(client.connection._descriptor or 0, bytes(65536))
+            assert not client.connection.send_at_once(b"x")
 
     run(test)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.serve.scheduling.batch_times import FRESH_SECONDS, GAIN, HISTORY, LONGEST_PAUSE, PAUSE, BatchTimes
-from turbopi.serve.scheduling.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
+from turbopi.serve.scheduling.schedule import LATE_TIMER, OVERTAKEN, Decision, Priority, Refused, Request, Schedule
 from turbopi.serve.scheduling.think_time import MAX_SOURCES, ThinkTimes
 
 T1 = 0.01
@@ -145,8 +146,51 @@ def arrivals(draw: st.DrawFn, *, plain: bool = False) -> list[Request]:
     return made
 
 
+class Compared(Schedule):
+    """Asks a copy at each arrival whether the request begins alone, and compares what it does then with what it did."""
+
+    copy: Schedule | None = None
+    began_alone = 0
+
+    def add(self, request: Request, now: float) -> list[Refused]:
+        copy, same = deepcopy((self, request))
+        if copy.begin_alone(same, now):
+            copy.note(same, now)
+            self.copy = copy
+        return super().add(request, now)
+
+    def decide(self, now: float) -> Decision:
+        copy, self.copy = self.copy, None
+        decision = super().decide(now)
+        if copy is not None:
+            assert len(decision.turn) == len(copy._running) == 1 and not decision.refused and decision.wake is None
+            for name in ("_until", "_exhausted_last", "_gaps", "_last_arrival", "_number", "crowded_until", "waiting"):
+                assert getattr(copy, name) == getattr(self, name)
+            for name in ("order", "in_crowd", "queued", "level", "served", "number"):
+                assert getattr(copy._running[0], name) == getattr(decision.turn[0], name)
+            self.began_alone += 1
+        return decision
+
+
 tables = st.sampled_from([PAYING, SERIAL, {1: T1}, {1: 0.01, 2: 0.011, 4: 0.03, 5: 0.031}])
 limits = st.integers(0, 20)
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_a_request_that_begins_alone_is_the_turn_that_it_would_have_got(
+    made: list[Request], seconds: dict[int, float], limit: int
+) -> None:
+    simulate(Compared(limit, table(seconds)), made)
+
+
+@pytest.mark.parametrize(("sources", "seconds", "alone"), [(1, PAYING, 5), (2, SERIAL, 5), (2, PAYING, 1)])
+def test_a_request_begins_alone_unless_another_client_may_come_soon(
+    sources: int, seconds: dict[int, float], alone: int
+) -> None:
+    schedule = Compared(4, table(seconds) if seconds is PAYING else None)
+    simulate(schedule, [request(number * 0.1, source=number % sources) for number in range(5)])
+    assert schedule.began_alone == alone
 
 
 @settings(max_examples=100, deadline=None)

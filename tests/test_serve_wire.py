@@ -534,7 +534,13 @@ def test_messages_that_differ_in_numbers_alone_are_read_without_a_walk(monkeypat
     for number in (1, 1):
         unpacker.unpack(request_of("stack", number))
     expected = unpack(again := request_of("stack", 1))
+    timing = [pack({"actions": np.zeros(2), "timing": {"infer_ms": ms}}) for ms in (1.5, 2.5, 3.5)]
+    timed = [wire.Unpacker() for _ in timing]
+    for one in timed:
+        one.unpack(timing[0])
+        one.unpack(timing[1])
     monkeypatch.setattr(wire, "unpack", lambda *_, **__: pytest.fail("walked"))
+    assert [one.unpack(data)["timing"]["infer_ms"] for one, data in zip(timed, timing, strict=True)] == [1.5, 2.5, 3.5]
     first, second = unpacker.unpack(again), unpacker.unpack(again)
     assert_same(first, expected)
     first["state"]["joints"] = first["more"] = None
@@ -552,6 +558,8 @@ def test_a_message_that_looks_different_is_read_as_ever() -> None:
         request_of("unstack", 2, steps=[1, 2]),
         *(request_of("unstack", 2, steps=[1, [2, 3]]) for _ in range(3)),
         *(pack([1, 2]) for _ in range(3)),
+        *(pack({"actions": np.ones(2), "timing": {"ms": ms}}) for ms in (1.5, 2.5, -0.0, float("inf"))),
+        *(msgpack.packb({"single": single}, use_single_float=True) for single in (1.5, 1.5, 2.5)),
     ):
         assert_same(unpacker.unpack(data), unpack(data))
     (own,) = {id(unpacker.unpack(request_of("a", 1, steps=[1]))["steps"]) for _ in range(1)}

@@ -1,22 +1,25 @@
 """The load test: when requests are sent and what is counted, with a clock of the test's own; and small whole runs."""
 
+import importlib
 import io
 import json
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from load_test import stand_in
+from load_test import marks, stand_in, timeline
 from load_test.__main__ import main, show
 from load_test.connections import connect, kind_of
 from load_test.document import COLUMNS, Load, LoadDocument, Spread, read_load, summary
 from load_test.observations import OF_A_CLIENT, image_size, observations, shapes
 from load_test.run import Wanted, run
 from load_test.schedule import ERROR_PAUSE, Clock, Refused, Request, closed_loop, due_times, open_loop
+from load_test.timeline import WARM_UP, items
 from rich.console import Console
 from serve_fakes import FakePolicy
 from test_serve_openpi_client import openpi_client
@@ -406,3 +409,34 @@ def test_the_table_fits_80_columns_and_warns_of_what_would_mislead() -> None:
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(len, shown.splitlines())) <= COLUMNS and shown.count("12345679") == 4 * 6
     assert "errors: 2 busy" in shown and "3 requests were never sent" in shown and "The clients were so busy" in shown
+
+
+# --- timelines --------------------------------------------------------------------------------------------------------
+
+
+def test_every_mark_is_of_a_function_that_there_is() -> None:
+    for mark in marks.MARKS:
+        module, _, name = mark.function.partition(":")
+        assert callable(reduce(getattr, name.split("."), importlib.import_module(module))), mark
+
+
+def test_an_item_is_what_passes_between_two_marks_of_a_call_whatever_else_was_noted() -> None:
+    begin, end = [float(call) for call in range(WARM_UP + 2)], [call + 0.5 for call in range(WARM_UP + 2)]
+    client = {"begin": begin, "end": end, "packed": [one + 0.01 for one in begin], "given": []}
+    turns = [one + 0.02 for one in begin] + [0.001]
+    server = {"turn": sorted(turns), "ended": [one + 0.4 for one in begin], "made": [one + 0.03 for one in begin]}
+    found = [(item.name, round(item.p50), item.calls) for item in items(client, server)]
+    assert [us for _, us, _ in found] == [10_000, 10_000, 10_000, 470_000]  # the policy's thread answered: no "ended"
+    assert {calls for *_, calls in found} == {2}
+
+
+@pytest.mark.slow  # two processes import what they need
+def test_a_timeline_is_drawn_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "timeline.json"
+    assert timeline.main(["--calls", "3", "--images", "64x48", "--out", str(file)]) == 0
+    document = json.loads(file.read_text())
+    names = [item["name"] for item in document["items"]]
+    assert {"pack", "parse", "read, schedule", "unpack"} < set(names) and document["calls"] == 3
+    assert document["beside_ms"]["p50"] <= document["latency_ms"]["p50"]
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in names) and max(map(len, shown.splitlines())) <= COLUMNS

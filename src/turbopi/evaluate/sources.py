@@ -14,7 +14,7 @@ from turbopi.quantization.formats import named_by
 from turbopi.realtime.messages import PREFIX, message
 from turbopi.realtime.queue import of_batch
 from turbopi.realtime.running_chunk import JoinMode
-from turbopi.realtime.wire import WireError, pack, unpack
+from turbopi.realtime.wire import WireError, pack_parts, unpack
 from turbopi.support.errors import ActionError, ConfigError, TurboPiError
 from turbopi.support.reading import is_finite, shown
 from turbopi.support.text import denoising
@@ -238,7 +238,7 @@ class RemotePolicy:
         from websockets.exceptions import WebSocketException
 
         try:
-            reply = self._socket.ask(pack(requested), ANSWER_S)
+            reply = self._socket.ask(pack_parts(requested), ANSWER_S)
         except (OSError, WebSocketException) as error:
             raise PolicyLost(
                 f"the policy server at {self._where} went away: {_reason(error)}. What was finished is kept: start the "

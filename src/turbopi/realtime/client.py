@@ -25,7 +25,8 @@ from turbopi.realtime.chunk import checked_answer
 from turbopi.realtime.messages import PREFIX, message
 from turbopi.realtime.policy_socket import PolicySocket
 from turbopi.realtime.running_chunk import RunningChunk
-from turbopi.realtime.wire import WireError, pack, unpack
+from turbopi.realtime.shared_memory import Parts
+from turbopi.realtime.wire import Unpacker, WireError, pack, pack_parts
 from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError, TurboPiError
 
 logger = logging.getLogger(__name__)
@@ -74,6 +75,7 @@ class RealTimeClient:
         self._api_key = api_key
         self._connect_s, self._answer_s = connect_s, answer_s
         self._lock = threading.Lock()
+        self._unpacker = Unpacker()
         self._socket: PolicySocket | None = None
         self._episode = self._reported = (
             0  # the one now, and the one that a server which keeps the running chunk knows of
@@ -255,7 +257,7 @@ class RealTimeClient:
         try:
             if isinstance(data, str):
                 raise WireError("a text frame where a message should be")
-            unpacked = unpack(data)
+            unpacked = self._unpacker.unpack(data)
             if not isinstance(unpacked, dict):
                 raise WireError(f"a {type(unpacked).__name__} where a map should be")
         except WireError as error:
@@ -288,10 +290,10 @@ def _url(host: str, port: int | None) -> str:
     return f"ws://[{host}]:{8000 if port is None else port}"
 
 
-def _packed(sent: Mapping[str, Any]) -> bytes:
-    """The message. Raises WireError, an ObservationError, that names the key of what can't be sent."""
+def _packed(sent: Mapping[str, Any]) -> Parts:
+    """The message's parts. Raises WireError, an ObservationError, that names the key of what can't be sent."""
     try:
-        return pack(sent)
+        return pack_parts(sent)
     except WireError as error:
         for key, value in sent.items():
             try:

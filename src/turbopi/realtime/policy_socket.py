@@ -1,23 +1,33 @@
 """A websocket to a policy server, on which nothing takes longer than its deadline.
 
-The websockets library ends waiting for an answer, but not sending: a server that has stopped reading holds `send` for
-ever, and with it every other call on the connection. Nor does it end a name's resolution. So a connection is made on a
-thread of its own, and at the deadline of an exchange the socket is shut down, which ends whatever waits on it.
+The caller's thread itself sends and waits for the answer: a thread in between would have to wake up, too.
+The websockets library gives the protocol without its sockets and threads. What it can't do is to end a call at its
+deadline: a server that has stopped reading holds `send` for ever, and a name's resolution has no end. So a connection
+is made on a thread of its own, and at the deadline of an exchange the socket is shut down, which ends whatever waits on
+it. The thread that does so also answers the server's pings, and its goodbye, while nobody calls.
 """
 
 import contextlib
+import selectors
 import socket
 import threading
 import time
+from collections import deque
 from concurrent.futures import Future, InvalidStateError, wait
-from typing import Any
 
+from websockets.client import ClientProtocol
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import USER_AGENT, Response
+from websockets.protocol import State
+from websockets.uri import parse_uri
 
+from turbopi.realtime.shared_memory import HEADER, WANTED, Parts, SharedWriter, writer
 from turbopi.realtime.wire import MAX_BYTES
 
 CLOSE_S = 1.0  # for the goodbye: a server that hangs says none
+IDLE_S = 0.25  # after a call, from which on somebody else reads the socket
+READ_BYTES = 2**16
 
 
 class PolicySocket:
@@ -31,31 +41,38 @@ class PolicySocket:
 
     def __init__(self, url: str, api_key: str | None, seconds: float) -> None:
         deadline = time.monotonic() + seconds
-        self._open, self._connection = _connected(url, api_key, seconds)
-        self.socket = self._connection.socket
-        self._cutter = _Cutter(self.socket)
+        self._stream = _connected(url, api_key, seconds)
+        self.socket = self._stream.socket
+        self._memory: SharedWriter | None = writer(self._stream.offer)
+        self._cutter = _Cutter(self._stream)
         self.greeting = self._exchange(None, deadline, seconds)
 
-    def ask(self, message: bytes, seconds: float) -> str | bytes:
-        """Send a message; the server's answer to it, within `seconds` from now.
+    def ask(self, parts: Parts, seconds: float) -> str | bytes:
+        """Send a message of these parts; the server's answer to it, within `seconds` from now.
 
         After anything that it raises, Ctrl-C too, the connection is lost: a late answer is never the next message's.
         """
-        return self._exchange(message, time.monotonic() + seconds, seconds)
+        deadline = time.monotonic() + seconds
+        message = None if self._memory is None else self._memory.put(parts)
+        return self._exchange(b"".join(parts) if message is None else message, deadline, seconds)
 
     def close(self) -> None:
         """Say goodbye, for at most CLOSE_S seconds."""
         self._cutter.set(time.monotonic() + CLOSE_S)
-        with contextlib.suppress(Exception):  # it may be gone already
-            self._open.close()
+        with contextlib.suppress(Exception), self._stream.using:  # it may be gone already
+            self._stream.say_goodbye()
         self._cutter.cut()
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
 
     def _exchange(self, message: bytes | None, deadline: float, seconds: float) -> str | bytes:
         self._cutter.set(deadline)
         try:
-            if message is not None:
-                self._connection.send(message)
-            reply = self._connection.recv(timeout=max(0.0, deadline - time.monotonic()))
+            with self._stream.using:
+                if message is not None:
+                    self._stream.send(message)
+                reply = self._stream.receive()
         except BaseException as error:
             self._cutter.cut()  # closing would wait for the server
             self.close()
@@ -66,72 +83,190 @@ class PolicySocket:
         return reply
 
 
-class _Cutter:
-    """Shuts a socket down when the deadline is over, on a thread of its own: then all calls on the socket end."""
+class _Stream:
+    """Websocket messages over a socket: all that comes is read by who calls, under the lock `using`."""
 
-    def __init__(self, sock: socket.socket) -> None:
-        self._sock = sock
-        self._changed = threading.Condition()
+    def __init__(self, url: str, api_key: str | None, seconds: float) -> None:
+        """Connect, and do the handshake."""
+        uri = parse_uri(url)
+        self.using = threading.Lock()
+        self._events: deque[object] = deque()
+        self._protocol = ClientProtocol(uri, max_size=MAX_BYTES)
+        self.socket = socket.create_connection((uri.host, uri.port), timeout=seconds)
+        try:
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if uri.secure:
+                import ssl
+
+                self.socket = ssl.create_default_context().wrap_socket(self.socket, server_hostname=uri.host)
+            request = self._protocol.connect()
+            request.headers["User-Agent"] = USER_AGENT
+            request.headers[HEADER] = WANTED
+            if api_key:
+                request.headers["Authorization"] = f"Api-Key {api_key}"
+            self._protocol.send_request(request)
+            self._flush()
+            response = self._next()
+            if self._protocol.handshake_exc is not None:
+                raise self._protocol.handshake_exc
+            assert isinstance(response, Response)
+            self.offer = response.headers.get(HEADER)  # of shared memory
+            self.socket.settimeout(None)
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def send(self, message: bytes) -> None:
+        """Raises ConnectionClosed and OSError, as `receive`."""
+        if self._protocol.state is not State.OPEN:
+            self._read_to_end()
+            raise self._protocol.close_exc
+        self._protocol.send_binary(message)
+        self._flush()
+
+    def receive(self) -> str | bytes:
+        """The next message."""
+        frames: list[Frame] = []
+        while not frames or not frames[-1].fin:
+            event = self._next()
+            if isinstance(event, Frame) and event.opcode < Opcode.CLOSE:
+                frames.append(event)
+        data = b"".join([frame.data for frame in frames])
+        return data.decode(errors="replace") if frames[0].opcode is Opcode.TEXT else data
+
+    def read_on(self) -> None:
+        """Handle what has come, now that the socket is readable: pings are answered."""
+        with contextlib.suppress(OSError, WebSocketException):  # the next call says so
+            self._read()
+
+    def say_goodbye(self) -> None:
+        """Close, and wait for the server to close."""
+        if self._protocol.state is State.OPEN:
+            self._protocol.send_close(CloseCode.NORMAL_CLOSURE)
+            self._flush()
+        self._read_to_end()
+
+    @property
+    def ended(self) -> bool:
+        return self._protocol.state is State.CLOSED
+
+    def _read_to_end(self) -> None:
+        while not self.ended:
+            self._read()
+
+    def _next(self) -> object:
+        while not self._events:
+            if self.ended:
+                if self._protocol.handshake_exc is None:
+                    raise self._protocol.close_exc
+                return None
+            self._read()
+        return self._events.popleft()
+
+    def _read(self) -> None:
+        if data := self.socket.recv(READ_BYTES):
+            self._protocol.receive_data(data)
+        else:
+            self._protocol.receive_eof()
+        self._events.extend(self._protocol.events_received())
+        self._flush()
+
+    def _flush(self) -> None:
+        for data in self._protocol.data_to_send():
+            if data:
+                self.socket.sendall(data)
+            else:  # no more will follow
+                with contextlib.suppress(OSError):
+                    self.socket.shutdown(socket.SHUT_WR)
+
+
+class _Cutter:
+    """Shuts the socket down when the deadline is over, on a thread of its own: then all calls on the socket end.
+
+    IDLE_S after a call, that thread reads what the server sends without having been called.
+    """
+
+    def __init__(self, stream: _Stream) -> None:
+        self._stream, self._changing = stream, threading.Lock()
         self._deadline: float | None = None
-        self._sleeps_until: float | None = None
+        self._wakes_at: float | None = None  # None: when it is woken, or the server sends something
+        self._used = time.monotonic()
         self._cut = False
+        self._wake, self._woken = socket.socketpair()
+        self._wake.setblocking(False)
         threading.Thread(target=self._watch, name="turbopi-deadline", daemon=True).start()
 
     def set(self, deadline: float | None) -> None:
-        """The moment, of time.monotonic(), or None. Costs a microsecond: a later one wakes nobody."""
-        with self._changed:
+        """The moment, of time.monotonic(), or None. Costs a microsecond: within IDLE_S, a later one wakes nobody."""
+        with self._changing:
             self._deadline = deadline
-            if deadline is not None and (self._sleeps_until is None or deadline < self._sleeps_until):
-                self._changed.notify()
+            if deadline is None:
+                self._used = time.monotonic()
+            elif self._wakes_at is None or deadline < self._wakes_at:
+                self._wake_up()
 
     def cut(self) -> None:
         """Now, and for good."""
-        with self._changed:
+        with self._changing:
             self._cut = True
-            self._changed.notify()
+            self._wake_up()
             with contextlib.suppress(OSError):  # it is closed already
-                socket.socket.shutdown(self._sock, socket.SHUT_RDWR)  # SSLSocket's own would forget that it has TLS
+                socket.socket.shutdown(self._stream.socket, socket.SHUT_RDWR)  # SSLSocket's own forgets that it has TLS
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(OSError):  # it has been woken often enough, or has ended
+            self._wake.send(b"x")
 
     def _watch(self) -> None:
-        with self._changed:
+        sock = self._stream.socket
+        with selectors.DefaultSelector() as called, selectors.DefaultSelector() as idle, self._woken, self._wake:
+            called.register(self._woken, selectors.EVENT_READ)
+            idle.register(self._woken, selectors.EVENT_READ)
+            idle.register(sock, selectors.EVENT_READ)
             while not self._cut:
-                left = None if self._deadline is None else self._deadline - time.monotonic()
-                if left is not None and left <= 0:
-                    break
-                self._sleeps_until = self._deadline
-                self._changed.wait(left)
+                with self._changing:
+                    now = time.monotonic()
+                    busy = self._deadline is not None or now < self._used + IDLE_S
+                    if self._deadline is not None and self._deadline <= now:
+                        break
+                    if not busy and self._stream.ended:  # the next call says so
+                        break
+                    self._wakes_at = min(self._deadline or now + IDLE_S, now + IDLE_S) if busy else None
+                ready = (called if busy else idle).select(self._wakes_at and self._wakes_at - now)
+                for key, _ in ready:
+                    if key.fileobj is self._woken:
+                        self._woken.recv(READ_BYTES)
+                    elif self._stream.using.acquire(blocking=False):
+                        try:
+                            self._stream.read_on()
+                        finally:
+                            self._stream.using.release()
         self.cut()
+        sock.close()
 
 
-def _connected(url: str, api_key: str | None, seconds: float) -> tuple[contextlib.ExitStack, ClientConnection]:
-    """The connection, and what closes it. One that is there too late is closed."""
-    opened: Future[tuple[contextlib.ExitStack, ClientConnection]] = Future()
-    options: dict[str, Any] = {
-        "additional_headers": {"Authorization": f"Api-Key {api_key}"} if api_key else None,
-        "compression": None,
-        "max_size": MAX_BYTES,
-        "open_timeout": seconds,
-        "close_timeout": CLOSE_S,
-        "ping_interval": None,  # openpi's server answers no ping while it computes
-        "proxy": None,
-    }
+def _connected(url: str, api_key: str | None, seconds: float) -> _Stream:
+    """The connection. One that is there too late is closed."""
+    opened: Future[_Stream] = Future()
 
     def open_it() -> None:
-        stack = contextlib.ExitStack()
         try:
-            opened.set_result((stack, stack.enter_context(connect(url, **options))))
-        except InvalidStateError:  # nobody waits for it any more
-            stack.close()
+            stream = _Stream(url, api_key, seconds)
         except BaseException as error:
             with contextlib.suppress(InvalidStateError):
                 opened.set_exception(error)
+            return
+        try:
+            opened.set_result(stream)
+        except InvalidStateError:  # nobody waits for it any more
+            stream.socket.close()
 
     threading.Thread(target=open_it, name="turbopi-connecting", daemon=True).start()
     try:
         wait((opened,), seconds)
     except BaseException:  # Ctrl-C
         if not opened.cancel() and opened.exception() is None:
-            opened.result()[0].close()
+            opened.result().socket.close()
         raise
     if opened.cancel():
         raise TimeoutError(f"nothing came within {seconds:g} s")

@@ -62,6 +62,7 @@ class _Call:
 
     observations: Sequence[dict[str, Any]]
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    answer: Callable[[Result], object] | None = None
 
 
 class PolicyCalls:
@@ -199,7 +200,7 @@ class PolicyCalls:
 
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
-        request.call = _Call([observation], arguments)
+        request.call = _Call([observation], arguments, request.answer)
         request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
         request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
         results = self.worker.submit(request)
@@ -247,16 +248,19 @@ class PolicyCalls:
 
     def _run_turn(self, turn: tuple[Request, ...]) -> Ran:
         now = time.perf_counter()
+        ran = self._run_calls([request.call for request in turn])
         for request in turn:
             self._metrics.queue_seconds.observe(now - request.queued)
-        calls: list[_Call] = [request.call for request in turn]
+        return ran
+
+    def _run_calls(self, calls: Sequence[_Call]) -> Ran:
         if len(calls) == 1:
             return self._run_call(calls[0])
         observations = [observation for call in calls for observation in call.observations]
         self._metrics.batch_size.observe(len(observations))
         results = self._infer_together(observations, [call.arguments for call in calls for _ in call.observations])
         if not results:  # one observation spoils the batch: each request runs again, in a turn of its own
-            return Ran([None] * len(turn))
+            return Ran([None] * len(calls))
         of_calls, at = [], 0
         for call in calls:
             of_calls.append(results[at : at + len(call.observations)])
@@ -264,19 +268,27 @@ class PolicyCalls:
         return Ran(of_calls, _turn_seconds(results))
 
     def _run_call(self, call: _Call) -> Ran:
-        """One request: of one observation, or of the rows of a batch message."""
-        self._metrics.batch_size.observe(len(call.observations))
-        if len(call.observations) > 1:
-            if results := self._infer_together(call.observations, [{}] * len(call.observations)):
+        """One request: of one observation, or of the rows of a batch message.
+
+        If no other waits for this thread, it sends the answer itself: the event loop would do so two turns later.
+        """
+        rows = len(call.observations)
+        if rows > 1:
+            self._metrics.batch_size.observe(rows)
+            if results := self._infer_together(call.observations, [{}] * rows):
                 return Ran([results], _turn_seconds(results))
-            return Ran([[self._infer(observation, {}) for observation in call.observations]])
+            return Ran([[self._counted(self._infer(observation, {})) for observation in call.observations]])
         (observation,) = call.observations
         if self._pipelined and not call.arguments:
             started = time.perf_counter()
+            self._metrics.batch_size.observe(1)
             future = self._submit_to_policy(observation)
             return Ran([future], time.perf_counter() - started)
         result = self._infer(observation, call.arguments)
-        return Ran([[result]], None if result.error else result.seconds)
+        if call.answer is not None and result.error is None and not self.waiting:
+            call.answer(result)
+        self._metrics.batch_size.observe(1)
+        return Ran([[self._counted(result)]], None if result.error else result.seconds)
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
         if OBSERVE in arguments:
@@ -319,7 +331,7 @@ class PolicyCalls:
             logger.exception("a batch of %d failed: its observations run one by one", rows)
         finally:
             self._metrics.inference_seconds.observe(time.perf_counter() - started)
-        results = [self._infer(*one) for one in zip(observations, arguments, strict=True)]
+        results = [self._counted(self._infer(*one)) for one in zip(observations, arguments, strict=True)]
         if all(result.error != "policy" for result in results):  # it was the batch's fault, not one observation's
             joins = " that join chunks" if any(arguments) else ""
             pause = (self.joining if joins else self.times).failed(rows, time.perf_counter())
@@ -337,7 +349,7 @@ class PolicyCalls:
             answer.set_exception(error)
 
         def done(ran: "Future[dict[str, Any]]") -> None:
-            results.set_result([self._result(started, ran.result, {})])
+            results.set_result([self._counted(self._result(started, ran.result, {}))])
 
         answer.add_done_callback(done)
         return results
@@ -364,8 +376,10 @@ class PolicyCalls:
         except BaseException:  # sys.exit() in a policy mustn't end the server either
             logger.exception("the policy failed")
             return Result(seconds(), error="policy", text=traceback.format_exc())
-        finally:
-            self._metrics.inference_seconds.observe(seconds())
+
+    def _counted(self, result: Result) -> Result:
+        self._metrics.inference_seconds.observe(result.seconds)
+        return result
 
 
 def _sizes(times: BatchTimes) -> list[int]:
@@ -416,7 +430,8 @@ def _checked(result: Result, answer: Any, arguments: Mapping[str, Any]) -> Resul
     if OBSERVE in arguments:
         return replace(result, answer=answer)
     try:
-        return replace(result, answer=checked_answer(answer, model_actions=bool(arguments.get("model_actions"))))
+        checked = checked_answer(answer, model_actions=bool(arguments.get("model_actions")))
+        return Result(result.seconds, checked, batch=result.batch, run=result.run)  # sooner than `replace`
     except ActionError as error:
         return replace(result, error="actions", text=str(error))
 

@@ -7,23 +7,28 @@ zero_copy.py.
 """
 
 import asyncio
+import contextlib
+import os
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode, Frame, Opcode
-from websockets.protocol import State
+from websockets.http11 import Request, Response
+from websockets.protocol import Event, State
 from websockets.server import ServerProtocol
 
 from turbopi.policy.watch import Watch
+from turbopi.realtime.shared_memory import HEADER, WANTED, SharedSlots
 from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.zero_copy import SpareBuffer, ZeroCopyFrame, apply_mask, is_zero_copy
+from turbopi.serve.zero_copy import MAX_BYTES, SpareBuffer, ZeroCopyFrame, apply_mask, is_zero_copy
 
 MAX_UNANSWERED = 2  # messages of one client: one that is computed, one that waits
 READ_BYTES = 512 * 1024  # at most, in one read of a socket: two images of 224 x 224 are 300 KB
@@ -31,6 +36,7 @@ BYTES_OF_ONE_WORK = 65536
 DISCARD_PAUSE_SECONDS = 0.002  # between reads of discarded bytes: 128 MB/s and more, so that a client gets to read why
 WORK_OF_A_SECOND = 4000.0  # of decoding: 5 * Limits.work_total_rate, so all who are slowed get a fifth of the loop
 WORK_OF_A_REFUSAL = 3.0  # to find the error, send and log it
+CAN_WRITE = os.name == "posix"  # to a socket by its descriptor
 
 
 @dataclass
@@ -43,6 +49,7 @@ class Shared:
     clock: Callable[[], float] = time.monotonic
     memory: MemoryBudget = field(init=False)
     pool: WorkPool = field(init=False)
+    slots: int = field(default=0, init=False)  # clients with shared memory
     spare: SpareBuffer = field(default_factory=SpareBuffer, init=False)
     # One for all connections: what one read brought is handled before the next read.
     scratch: memoryview = field(default_factory=lambda: memoryview(bytearray(READ_BYTES)), init=False)
@@ -101,6 +108,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
         self.bad_in_a_row = 0
         self.robot = ""  # the name that its client gave; its session's, if it gave none
+        self.cycle_s: float | None = None  # from waiting for the last request to having sent its actions
         self.unpacker = Unpacker()  # of its messages
         self.watch, self.batch_watch = Watch(), Watch(remembers=False)  # of its robot; of the rows of batch messages
         self._owner, self._shared, self._limits = owner, shared, limits
@@ -114,6 +122,12 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._unanswered: deque[_Message] = deque()
         self._handed_over = 0  # bytes of messages
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._writing = threading.RLock()  # for the socket; other threads write to it in `send_at_once` alone
+        self._take: Callable[[bytes], asyncio.Future[Any] | None] | None = None
+        self._waiter: asyncio.Future[bytes | None] | None = None
+        self._slots: SharedSlots | None = None
+        self._unsent: bytes | memoryview = b""  # what the socket didn't take there
+        self._descriptor: int | None = None
 
     # --- what the server calls ----------------------------------------------------------------------------------------
 
@@ -150,6 +164,63 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self.bad_in_a_row = self.bad_in_a_row + 1 if how == "bad" else 0
         self._feed()
 
+    def offer_memory(self, request: Request, response: Response) -> None:
+        """Say in the response where a client on this host that asks for shared memory finds it."""
+        if request.headers.get(HEADER) != WANTED or response.status_code != 101 or not self._is_near():
+            return
+        if self._shared.slots >= self._limits.shared_memory:
+            return
+        with contextlib.suppress(OSError):  # the socket will do
+            self._slots = SharedSlots(min(MAX_BYTES, self._limits.free_bytes, self._limits.message_bytes))
+            self._shared.slots += 1
+            response.headers[HEADER] = self._slots.offer
+
+    def _is_near(self) -> bool:
+        """Whether its client is on this host, or behind a proxy on this host."""
+        near, far = (self.transport.get_extra_info(name) for name in ("sockname", "peername"))
+        return bool(near and far) and near[0] == far[0]
+
+    async def recv_taken(self, take: "Callable[[bytes], asyncio.Future[Any] | None]") -> str | bytes:
+        """`recv`, but `take` has the message at once, in the callback that received it, if it comes in one frame.
+
+        If it returns a Future, this returns the message when that is done: nothing is done for it before. It may not
+        raise. When the connection is lost meanwhile, this raises as `recv` does.
+        """
+        if not self.recv_messages.frames and self.protocol.state is State.OPEN:
+            self._waiter = waiter = self.loop.create_future()
+            self._take = take
+            try:
+                message = await waiter
+            finally:
+                self._take = self._waiter = None
+            if message is not None:
+                return message
+        return await self.recv()
+
+    def _wake(self, message: bytes | None) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(message)
+
+    def send_at_once(self, message: bytes) -> bool:
+        """Send a binary message from any thread, if that can be done now; False: it is to be sent by `send`.
+
+        The caller sees to it that nothing else is sent on this connection meanwhile, but for what the library sends.
+        """
+        frame = Frame(Opcode.BINARY, message).serialize(mask=False)
+        with self._writing:  # without the lock the descriptor might be another connection's by now
+            if self._descriptor is None or self.protocol.state is not State.OPEN or self.transport.is_closing():
+                return False
+            if self._unsent or self.transport.get_write_buffer_size():
+                return False
+            try:
+                sent = os.write(self._descriptor, frame)
+            except OSError:  # it takes nothing now, or is at its end, which the event loop sees, too
+                return False
+            if sent < len(frame):
+                self._unsent = memoryview(frame)[sent:]
+                self.loop.call_soon_threadsafe(self.send_data)
+            return True
+
     async def keepalive(self) -> None:
         """The library's, which cuts a client that doesn't answer a ping in time, but for those that are held back here:
         their pong may stand behind requests that wait for their turn, and aren't read yet.
@@ -168,6 +239,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super(ServerConnection, self).connection_made(transport)  # its own would start the library's server's handler
+        sock = transport.get_extra_info("socket")
+        self._descriptor = sock.fileno() if CAN_WRITE and sock is not None else None
         self._owner.connected(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
@@ -217,15 +290,25 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._feed()
 
     def send_data(self) -> None:
-        super().send_data()
+        with self._writing:
+            if self._unsent:
+                unsent, self._unsent = self._unsent, b""
+                self.transport.write(unsent)
+            super().send_data()
         if self.protocol.close_expected():
             self._once("close", self._limits.close_seconds, self.transport.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
+        with self._writing:  # asyncio closes the socket after this
+            super().connection_lost(exc)
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
+        self._wake(None)
+        if self._slots is not None:
+            self._slots.close()
+            self._slots = None
+            self._shared.slots -= 1
         self._credit.close()
         self._shared.memory.forget(self._feed)
         for message in (*self._unanswered, *([self._message] if self._message else ())):
@@ -240,6 +323,31 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             frames.queue.clear()
         else:  # a message that came a moment ago has woken `recv`, which counts on it
             self.loop.call_soon(frames.queue.clear)
+
+    def process_event(self, event: Event) -> None:
+        if self._slots is not None and isinstance(event, Frame) and event.opcode is Opcode.BINARY and event.fin:
+            event = self._from_slot(event, self._slots)
+        if self._take is not None and isinstance(event, Frame) and event.opcode < Opcode.CLOSE:
+            take, self._take = self._take, None
+            if event.opcode is Opcode.BINARY and event.fin and len(event.data) < MAX_BYTES:
+                message = bytes(event.data)
+                if (until := take(message)) is None:
+                    self._wake(message)
+                else:
+                    until.add_done_callback(lambda _: self._wake(message))
+                return
+            self._wake(None)
+        super().process_event(event)
+
+    def _from_slot(self, frame: Frame, slots: SharedSlots) -> Frame:
+        """The frame, or the message that it says is in a slot, paid for as if it had come through the socket."""
+        message = slots.message(bytes(frame.data))
+        if message is None:
+            return frame
+        work = len(message) / BYTES_OF_ONE_WORK
+        self._credit.spend(work)
+        self._unanswered[-1].work += work
+        return Frame(Opcode.BINARY, message)
 
     # --- what comes in ------------------------------------------------------------------------------------------------
 

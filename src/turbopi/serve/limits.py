@@ -37,6 +37,7 @@ class Limits:
     work_total_rate    the same for all connections that are slowed, together
     bad_messages       in a row, after which a connection is closed
     connections_rate   new connections a second
+    shared_memory      clients on this host that send through memory, 8 MB each; the others' messages take the socket
     watchers           of the server's page and its feed at once; they take no client's place
     """
 
@@ -55,6 +56,7 @@ class Limits:
     work_total_rate: float = 800.0
     bad_messages: int = 1000
     connections_rate: float = 50.0
+    shared_memory: int = 16
     watchers: int = 4
 
 

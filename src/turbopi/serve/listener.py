@@ -182,7 +182,9 @@ class Listener:
         """One connection, from its HTTP request to its end."""
         try:
             try:
-                await asyncio.wait_for(connection.handshake(self._let_in), self._shared.limits.handshake_seconds)
+                await asyncio.wait_for(
+                    connection.handshake(self._let_in, _offer_memory), self._shared.limits.handshake_seconds
+                )
             except Exception:  # its request was none, it left, or it took too long
                 return
             finally:
@@ -225,3 +227,8 @@ class Listener:
         if not self._clients:
             self._shared.spare.drop()
             trim_memory()
+
+
+def _offer_memory(connection: ServerConnection, request: Request, response: Response) -> None:
+    assert isinstance(connection, GuardedConnection)
+    connection.offer_memory(request, response)

@@ -132,6 +132,8 @@ class RealTime:
 
     def plan(self, received: Mapping[str, Any], connection: Hashable) -> Plan:
         """What to do with a request that has just come. Raises ObservationError."""
+        if self._options.execution is None and not any(key.startswith(PREFIX) for key in received):
+            return Plan(dict(received))
         now = self._clock()
         mode = received.get(PREFIX + "mode")
         unconditioned = isinstance(mode, str) and mode == NO_JOINING

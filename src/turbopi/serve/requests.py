@@ -9,6 +9,7 @@ docs/dev/request.md follows one observation all the way; docs/serving_sessions.m
 """
 
 import asyncio
+import contextlib
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +32,7 @@ from turbopi.realtime.messages import (
     as_number,
     notes_in,
 )
-from turbopi.realtime.wire import Unpacker, WireError
+from turbopi.realtime.wire import Unpacker, WireError, pack
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.memory import Histories
 from turbopi.serve.metrics import Metrics
@@ -141,12 +142,14 @@ class Reply(NamedTuple):
     """The map to send, with "server_timing", what the request said about scheduling, and the notes for the log.
 
     state  of the robot, as the policy read it; empty if it doesn't tell, and for a batch
+    sent   when the policy's thread has sent it; None: it is still to be sent
     """
 
     result: dict[str, Any]
     scheduling: "SchedulingOptions"
     notes: Sequence[Note] = ()
     state: Sequence[float] = ()
+    sent: float | None = None
 
 
 class ClientLeft(Exception):
@@ -157,14 +160,20 @@ class PolicyFailed(Exception):
     """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class ClientRequest:
-    """A message that was read: what to run (`plan`), when (`scheduling`), and for whom."""
+    """A message that was read: what to run (`plan`), when (`scheduling`), and for whom.
+
+    results  once it is submitted
+    reply    once it is made on the policy's thread
+    """
 
     plan: Plan
     scheduling: "SchedulingOptions"
     connection: GuardedConnection
     arrived: float
+    results: "asyncio.Future[list[Result]] | None" = None
+    reply: Reply | None = None
 
     def scheduled(self, rows: int = 1, remaining: int = 0) -> Request:
         """What the schedule gets, for `rows` observations of which `remaining` others follow in later parts."""
@@ -185,6 +194,9 @@ class ClientRequest:
             alone=connection.bad_in_a_row
             > 0,  # after a bad request the next is likely bad, too: it must spoil no batch
         )
+
+
+Begun = ClientRequest | Refusal
 
 
 class RequestHandler:
@@ -213,23 +225,39 @@ class RequestHandler:
         self._watches: OrderedDict[str, Watch] = OrderedDict()  # of named sessions, the last used one at the end
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
-    async def handle(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> Reply | Refusal:
-        """The reply to a message. Raises PolicyFailed and ClientLeft."""
+    async def take(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+        """`begin`, of a message of any size."""
+        if len(message) < LARGE:
+            return self.begin(connection, message, arrived)
+        started, loop = time.perf_counter(), asyncio.get_running_loop()
+        decoded = loop.run_in_executor(self._decoder, decode, message, self._max_bytes, Unpacker())
+        await asyncio.wait((decoded,))
+        connection.took(time.perf_counter() - started)
+        return self._begin(connection, decoded.result, arrived)
+
+    def begin(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+        """Submit the request that a message holds, without waiting. For its results call `finish`, or `drop`."""
+        return self._begin(connection, partial(self._decode, connection, message), arrived)
+
+    def _begin(self, connection: GuardedConnection, received: Callable[[], dict[str, Any]], arrived: float) -> "Begun":
         if (lost := self._why_lost()) is not None:
             return Refusal("lost", REFUSALS["lost"].format(lost))
         try:
-            request = self.read(await self._decode(connection, message), connection, arrived)
+            request = self.read(received(), connection, arrived)
         except WireError as error:
             return Refusal("malformed", f"bad request: {error}")
         except ObservationError as error:
             return Refusal("observation", REFUSALS["observation"].format(error))
-        results = await self._run(request)
+        request.results = self._submit(request)
+        return request
+
+    async def finish(self, request: ClientRequest) -> Reply | Refusal:
+        """The reply to a request. Raises PolicyFailed and ClientLeft."""
+        results = await self._results(request)
         failed = first_error(request, results)
         self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
         if failed is None:
-            state = _state_of(request, results)
-            noted = self._note(request, results)
-            return Reply(self._answer(request, results), request.scheduling, noted, state)
+            return request.reply or self._reply(request, results)
         if failed.error == "policy":
             raise PolicyFailed(failed.text)
         assert failed.error is not None
@@ -239,14 +267,11 @@ class RequestHandler:
         """End the decoding thread. It isn't waited for."""
         self._decoder.shutdown(wait=False)
 
-    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
+    def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
         """The message as a map. Raises WireError."""
         started = time.perf_counter()
         try:
-            if len(message) < LARGE:
-                return decode(message, self._max_bytes, connection.unpacker)
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._decoder, decode, message, self._max_bytes, Unpacker())
+            return decode(message, self._max_bytes, connection.unpacker)
         finally:
             connection.took(time.perf_counter() - started)
 
@@ -280,14 +305,26 @@ class RequestHandler:
         check_batch_shapes(plan.observation, scheduling.batch)
         return ClientRequest(plan, scheduling, connection, arrived)
 
-    async def _run(self, request: ClientRequest) -> list[Result]:
-        """Submit it and wait for a result of each observation. Raises ClientLeft if the client leaves first."""
-        plan, batch, disconnected = request.plan, request.scheduling.batch, request.connection.connection_lost_waiter
+    def drop(self, request: ClientRequest) -> None:
+        """Its client has left before anybody waited for its results."""
+        assert request.results is not None
+        request.results.cancel()
+        self._release(request.plan)
+
+    def _submit(self, request: ClientRequest) -> "asyncio.Future[list[Result]]":
+        plan, batch = request.plan, request.scheduling.batch
         if batch is None:
-            results = self._calls.submit(request.scheduled(), plan.observation, plan.arguments)
-        else:
-            row = partial(batch_row, plan.observation)
-            results = asyncio.ensure_future(self._calls.submit_batch(request.scheduled, row, batch))
+            scheduled = request.scheduled()
+            if plan.session is None and plan.name is None and self._histories is None:
+                scheduled.answer = partial(self._answer_at_once, request)
+            return self._calls.submit(scheduled, plan.observation, plan.arguments)
+        row = partial(batch_row, plan.observation)
+        return asyncio.ensure_future(self._calls.submit_batch(request.scheduled, row, batch))
+
+    async def _results(self, request: ClientRequest) -> list[Result]:
+        """A result of each observation. Raises ClientLeft if the client leaves first."""
+        results, disconnected = request.results, request.connection.connection_lost_waiter
+        assert results is not None
 
         def cancel(_: object) -> None:
             results.cancel()
@@ -301,9 +338,25 @@ class RequestHandler:
             raise
         finally:
             disconnected.remove_done_callback(cancel)
-            self._real_time.release(plan)
-            if self._histories is not None:
-                self._histories.release(plan)
+            self._release(request.plan)
+
+    def _release(self, plan: Plan) -> None:
+        self._real_time.release(plan)
+        if self._histories is not None:
+            self._histories.release(plan)
+
+    def _reply(self, request: ClientRequest, results: Sequence[Result]) -> Reply:
+        """Of results that all have actions. On any thread, if all that it touches is the connection's own."""
+        state = _state_of(request, results)
+        noted = self._note(request, results)
+        return Reply(self._answer(request, results), request.scheduling, noted, state)
+
+    def _answer_at_once(self, request: ClientRequest, result: Result) -> None:
+        """Send the reply from the policy's thread, if that can be done now."""
+        request.reply = reply = self._reply(request, [result])
+        with contextlib.suppress(WireError):  # the event loop's thread says so
+            if request.connection.send_at_once(pack(reply.result)):
+                request.reply = reply._replace(sent=time.perf_counter())
 
     def _note(self, request: ClientRequest, results: Sequence[Result]) -> list[Note]:
         """Put notes in place of the readings of a request's answers. Returns those that the log hasn't said yet."""
@@ -355,6 +408,8 @@ class RequestHandler:
         server_timing: dict[str, float] = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
         if (largest := max(run.batch for run in runs)) > 1:
             server_timing["batch"] = largest
+        if request.connection.cycle_s is not None:
+            server_timing["prev_total_ms"] = request.connection.cycle_s * 1e3
         if request.scheduling.batch is None:
             (answer,) = answers
             return {**self._real_time.finish(request.plan, answer), "server_timing": server_timing}

@@ -46,7 +46,16 @@ from turbopi.serve.options import ServerOptions
 from turbopi.serve.page.http import is_feed
 from turbopi.serve.page.live import Live
 from turbopi.serve.real_time import RealTime
-from turbopi.serve.requests import Calls, ClientLeft, PolicyFailed, Refusal, RequestHandler, batch_row
+from turbopi.serve.requests import (
+    Begun,
+    Calls,
+    ClientLeft,
+    ClientRequest,
+    PolicyFailed,
+    Refusal,
+    RequestHandler,
+    batch_row,
+)
 from turbopi.serve.signals import stop_signals
 from turbopi.support.errors import ConfigError, DeviceLost
 
@@ -320,24 +329,21 @@ class PolicyServer:
 
     async def _converse(self, connection: GuardedConnection) -> None:
         """One response for every request, until the client leaves or the server stops."""
-        previous_total: float | None = None
         while not self._stopping:
             started = time.perf_counter()
-            self._idle.add(connection)
-            message = await connection.recv()
-            self._idle.discard(connection)
-            received = time.perf_counter()
-            self.metrics.requests.inc()
-            reply = await self._requests.handle(connection, message, received)
+            message, received, begun = await self._next(connection)
+            reply = begun if isinstance(begun, Refusal) else await self._requests.finish(begun)
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
                 continue
-            result, scheduling, notes, _ = reply
-            if previous_total is not None:
-                result["server_timing"]["prev_total_ms"] = previous_total * 1e3
-            await connection.send(pack(result))
-            finished = time.perf_counter()
-            await asyncio.sleep(0)  # the other clients of the batch get their answers before what follows
+            result, scheduling, notes = reply.result, reply.scheduling, reply.notes
+            if reply.sent is None:
+                await connection.send(pack(result))
+                finished = time.perf_counter()
+                await asyncio.sleep(0)  # the other clients of the batch get their answers before what follows
+            else:
+                await connection.drain()
+                finished = reply.sent
             self.metrics.request_seconds.observe(finished - received)
             if scheduling.firm:
                 self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
@@ -345,7 +351,7 @@ class PolicyServer:
                 self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
                 if self._live is not None:
                     self._live.noted(connection, note.kind, note.text)
-            previous_total = finished - started  # with the wait for the request, as openpi counts it
+            connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
             if "actions" not in result:  # a policy with memory has recorded the observation alone
                 connection.answered("good")
                 continue
@@ -355,9 +361,48 @@ class PolicyServer:
             if self._recorder is not None:
                 assert isinstance(message, bytes)
                 self._record(message, result, scheduling.batch)
-            del message, reply, result  # a connection that waits must not hold them in memory
+            del message, begun, reply, result  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
+
+    async def _next(self, connection: GuardedConnection) -> tuple[str | bytes, float, Begun]:
+        """The next message, when it came, and its request, which is submitted by the callback that receives it.
+
+        Raises ClientLeft if the client leaves meanwhile.
+        """
+        begun: list[tuple[float, Begun | Exception]] = []
+
+        def begin(message: bytes) -> "asyncio.Future[Any] | None":
+            self._idle.discard(connection)
+            received = time.perf_counter()
+            try:
+                request = self._requests.begin(connection, message, received)
+            except Exception as error:  # not asyncio's to log: a fault of this server must cost one client
+                begun.append((received, error))
+                return None
+            self.metrics.requests.inc()
+            begun.append((received, request))
+            return None if isinstance(request, Refusal) or self._calls.waiting else request.results
+
+        self._idle.add(connection)
+        try:
+            message = await connection.recv_taken(begin)
+        except BaseException as error:
+            for _, one in begun:
+                if isinstance(one, ClientRequest):
+                    self._requests.drop(one)
+                    if isinstance(error, ConnectionClosed):
+                        raise ClientLeft from None
+            raise
+        self._idle.discard(connection)
+        if not begun:
+            received = time.perf_counter()
+            self.metrics.requests.inc()
+            return message, received, await self._requests.take(connection, message, received)
+        ((received, request),) = begun
+        if isinstance(request, Exception):
+            raise request
+        return message, received, request
 
     async def _refuse(self, connection: GuardedConnection, refusal: Refusal) -> None:
         """Send the refusal; close with 1008 after many bad requests in a row: such a client doesn't read answers."""

@@ -55,6 +55,7 @@ class Worker:
         self._background: set[Future[Any]] = set()  # work that turns began
         self._idle: asyncio.Future[None] | None = None  # `drain` waits for it
         self._timer: asyncio.TimerHandle | None = None
+        self._begun: tuple[Request, float] | None = None  # what the schedule doesn't know of yet
         self._stopping = False
 
     @property
@@ -91,8 +92,14 @@ class Worker:
             return results
         self._waiting[request] = results
         results.add_done_callback(partial(self._remove_cancelled, request))
-        self._refuse(self.schedule.add(request, time.perf_counter()))
-        self._next()
+        self._note_begun()
+        now = time.perf_counter()
+        if self.schedule.begin_alone(request, now):
+            self._begin((request,))
+            self._begun = request, now
+        else:
+            self._refuse(self.schedule.add(request, now))
+            self._next()
         return results
 
     def stop(self) -> None:
@@ -137,11 +144,21 @@ class Worker:
         self._refuse(decision.refused)
         self._set_timer(decision.wake)
         if decision.turn:
-            self._turns += 1
-            self._put(partial(self._run_turn, decision.turn, asyncio.get_running_loop()))
+            self._begin(decision.turn)
+
+    def _begin(self, turn: tuple[Request, ...]) -> None:
+        self._turns += 1
+        self._put(partial(self._run_turn, turn, asyncio.get_running_loop()))
+
+    def _note_begun(self) -> None:
+        """Have the schedule learn of the request that began alone: not at once, as the policy would wait for that."""
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            self.schedule.note(*begun)
 
     def _ended(self, turn: tuple[Request, ...], ran: Ran) -> None:
         self._turns -= 1
+        self._note_begun()
         self.schedule.freed(time.perf_counter(), ran.seconds)
         for request, results in zip(turn, ran.results, strict=True):
             if results is None and request in self._waiting:

@@ -8,6 +8,8 @@ off makes the message.
 
 from websockets.frames import Opcode, apply_mask  # the compiled one, if there is one
 
+from turbopi.realtime.shared_memory import DOORBELL_BYTES
+
 MIN_BYTES = 2**16  # bytes of a payload: what is smaller costs little either way
 MAX_BYTES = 4 * 2**20  # larger ones go through the library: so the one buffer stays small
 
@@ -15,9 +17,11 @@ MAX_BYTES = 4 * 2**20  # larger ones go through the library: so the one buffer s
 def is_zero_copy(first: int, second: int, length: int) -> bool:
     """Whether a frame that begins a message, with these first two bytes and a payload of `length`, is received here.
 
-    True for a binary message in one frame, masked, without reserved bits. The library gets all others, and checks them.
+    True for a binary message in one frame, masked, without reserved bits, if it is large or may say where in shared
+    memory one is. The library gets all others, and checks them.
     """
-    return first == 0x80 | Opcode.BINARY and second >= 0x80 and MIN_BYTES <= length <= MAX_BYTES
+    ours = first == 0x80 | Opcode.BINARY and second >= 0x80
+    return ours and (MIN_BYTES <= length <= MAX_BYTES or length == DOORBELL_BYTES)
 
 
 class SpareBuffer:

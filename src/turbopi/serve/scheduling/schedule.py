@@ -64,6 +64,7 @@ class Request:
     alone     never in a batch with others
     joins     it joins a chunk or requests model_actions: runs with such a request have a table T(B) of their own
     call      what to run; not read here
+    answer    sends its result at once, from the policy's thread; not read here
     """
 
     arrived: float
@@ -79,6 +80,7 @@ class Request:
     continued: bool = False  # of a message that has its place in the line already
     slowed: bool = False  # its source is read more slowly than it sends: its pauses say nothing, and it has no claim
     call: Any = None
+    answer: Callable[[Any], object] | None = None
     number: int = field(default=0, init=False)  # in the order in which they came
     overtaken: int = field(default=0, init=False)
     order: tuple[float, ...] = field(default=(), init=False)  # robots, then the earliest deadline, then who came first
@@ -191,7 +193,7 @@ class Schedule:
 
     def add(self, request: Request, now: float) -> list[Refused]:
         """A request has come. Those that are refused for it: an older one, or itself."""
-        self._note(request, now)
+        self.note(request, now)
         if (late := self._late_on_arrival(request, now)) is not None:
             return self._refuse([late], now)
         refused = self._replace(request)
@@ -211,6 +213,23 @@ class Schedule:
         if request.firm and request.priority == "robot":
             self._tight.note(request.source, request.deadline - request.arrived, now)
         return self._refuse(refused, now)
+
+    def begin_alone(self, request: Request, now: float) -> bool:
+        """Whether a request that has just come is the next turn at once: it is then, and `note` must be called for it.
+
+        That is what `add` and `decide` would find, some 50 us later: nothing runs or waits, it has no deadline of its
+        own, and nobody may come soon to run together with it.
+        """
+        if self._running or self._waiting or request.firm or request.continued:
+            return False
+        if not request.alone and self._times((request,)).formed_largest(now) > request.rows:
+            own = {request.source}
+            if self._active.values(now).keys() - own or self._think_times.expected(now, ACTIVE_SECONDS, own):
+                return False
+        request.queued = now
+        self._running, self._exhausted_last = (request,), False
+        self._until = now + self._turn_seconds((request,), now)
+        return True
 
     def remove(self, request: Request) -> None:
         """Its client has left."""
@@ -288,8 +307,8 @@ class Schedule:
         longest_ago = sorted(some, key=lambda one: one.served)[:safe]
         return min([one for one in some if one not in longest_ago], key=_strength)
 
-    def _note(self, request: Request, now: float) -> None:
-        """Give it its number, and learn how soon others follow."""
+    def note(self, request: Request, now: float) -> None:
+        """A request has come: give it its number, and learn how soon others follow."""
         self._number += 1
         request.number, request.queued = self._number, now
         if not request.continued:
@@ -329,6 +348,8 @@ class Schedule:
 
     def _expired(self, now: float) -> list[Refused]:
         """Those that wait and can't meet their deadline any more; they wait no longer."""
+        if not any(one.firm for one in self._waiting):  # nearly always
+            return []
         wait = self._until_free(now)
         late = [one for one in self._waiting if one.firm and now + wait + self._seconds(one, now) > one.deadline]
         for one in late:
