@@ -127,7 +127,7 @@ def robot_pipeline(checkpoint: "Checkpoint", robot: Any, default_prompt: str | N
     return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, default_prompt, robot)
 
 
-def _told(info: dict[str, Any], key: str, kind: str) -> str:
+def _input_row(info: dict[str, Any], key: str, kind: str) -> str:
     """What is sent under a robot's key; of an image also which of the model's cameras it is."""
     camera = info["cameras"].get(key, key)
     return kind if camera == key else f"{kind}, the model's {camera}"
@@ -168,7 +168,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         facts += [
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
-            *((f"  its {key}", _told(info, key, value)) for key, value in info.get("observation", {}).items()),
+            *((f"  its {key}", _input_row(info, key, value)) for key, value in info.get("observation", {}).items()),
             ("action horizon", f"{info['action_horizon']}, {_made_in(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             *([] if info["memory"] is None else [("memory", _memory(info["memory"]))]),
