@@ -4,10 +4,8 @@ TURBOPI_PLANTED names the one that is planted.
 """
 
 import dataclasses
-import itertools
 import os
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -39,11 +37,6 @@ def wrong_tile() -> None:
     made, ops.ops_of = ops.ops_of, with_fault
 
 
-def barrier() -> None:
-    """The test of the grid's barrier waits for a block that isn't there."""
-    stages.check_barrier = partial(stages.check_barrier, missing=1)
-
-
 def hangs() -> None:
     """The denoising kernel waits for a block that isn't there, for hours."""
 
@@ -58,22 +51,7 @@ def out_of_memory() -> None:
     torch.cuda.set_per_process_memory_fraction(0.001)
 
 
-def slow_clock() -> None:
-    """Every third turn takes three times as long."""
-    right, turn = stages.measure_calls, itertools.count()
-
-    def slow(*given: Any) -> dict[str, Any]:
-        factor = 3.0 if next(turn) % 3 == 0 else 1.0
-        found = right(*given)
-        times = {number: factor * value for number, value in found["total"].percentiles.items()}
-        return {**found, "total": dataclasses.replace(found["total"], percentiles=times)}
-
-    stages.measure_calls = slow
-
-
-FAULTS: dict[str, Callable[[], None]] = {
-    one.__name__: one for one in (wrong_tile, barrier, hangs, out_of_memory, slow_clock)
-}
+FAULTS: dict[str, Callable[[], None]] = {one.__name__: one for one in (wrong_tile, hangs, out_of_memory)}
 
 if planted := os.environ.get(VARIABLE):
     run.golden = lambda subject: None  # the other stages find it

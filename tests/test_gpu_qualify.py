@@ -29,11 +29,7 @@ pytestmark = [
 ]
 GPU = torch.device("cuda", 0)
 TIMES_UP_NEVER = 600.0  # seconds: the tests' machine may compile for others at the same time
-EXCLUDED = {  # by planted fault
-    "wrong_tile": "vision_attention",
-    "barrier": DENOISE,
-    "hangs": DENOISE,
-}
+EXCLUDED = {"wrong_tile": "vision_attention", "hangs": DENOISE}  # by planted fault
 
 
 def few_layers(base: PolicyConfig, **sizes: Any) -> Checkpoint:
@@ -97,10 +93,8 @@ def test_every_planted_fault_ends_in_a_policy_that_works(
         assert "attach the file that `turbopi doctor --qualify` wrote" in caplog.text
         if verdict.taken == "fused":
             assert policy.metadata["backend_details"]["excluded"] == verdict.excluded
-    elif fault == "out_of_memory":
-        assert (verdict.taken, verdict.failed) == ("cuda_graph", False) and "memory isn't enough" in verdict.reason
     else:
-        assert "times varied" in verdict.reason and verdict.taken is not None
+        assert (verdict.taken, verdict.failed) == ("cuda_graph", False) and "memory isn't enough" in verdict.reason
     assert policy.metadata["backend"] == verdict.taken and is_right(policy, checkpoint)
 
 

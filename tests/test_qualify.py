@@ -1,6 +1,6 @@
 """What the process does that qualifies a GPU: faults in operations, kernels, stages and times are found by their names.
 
-The GPU's answers are stand-ins; tests/test_gpu_qualify.py has the same faults on a GPU.
+The GPU's answers are stand-ins; tests/test_gpu_qualify.py plants three on a GPU.
 """
 
 import dataclasses
