@@ -10,7 +10,6 @@ connection of its own to the policy's server, which computes them in batches and
 import asyncio
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,12 +30,12 @@ KEYS = {
 ACTIONS = {"position": "delta_xyz", "rotation": "axis_angle", "gripper": "binary_close_positive"}
 
 
-@dataclass
 class Session:
     """One shard's episode: its connection to the policy, from the first observation on, and the rest of its chunk."""
 
-    client: RealTimeClient | None = None
-    chunk: deque[np.ndarray] = field(default_factory=deque)
+    def __init__(self) -> None:
+        self.client: RealTimeClient | None = None
+        self.chunk: deque[np.ndarray] = deque()
 
 
 class TurboPi(ModelServer):
@@ -69,9 +68,7 @@ class TurboPi(ModelServer):
             if not 1 <= chunk_size <= horizon:
                 raise ConfigError(f"chunk_size is {chunk_size}; expected 1 to {horizon}, the actions of a chunk")
             if "memory" in client.metadata:
-                raise ConfigError(
-                    "this policy has memory: it must see every step, and here it would see one of each chunk"
-                )
+                raise ConfigError("this policy has memory: it must see every step, and here it sees only some")
             if (client.metadata.get("real_time") or {}).get("execution"):
                 raise ConfigError("this server joins chunks by time, and a simulator waits: serve without --execution")
 
@@ -89,22 +86,19 @@ class TurboPi(ModelServer):
             await asyncio.to_thread(session.client.close)
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
-        """Sends an action; an error's text goes to the benchmark, which counts the episode as failed by an error."""
+        """Sends an action. An error's text goes to the harness, which marks the episode as failed."""
         session = self._sessions.get(ctx.session_id)
         if session is None:
             raise ObservationError("an observation came before the start of an episode")
         if obs.get("episode_restart"):  # CALVIN's next instruction: what is left of the chunk follows the last one
             session.chunk.clear()
         if not session.chunk:
+            named = {key: value_at(obs, source) for key, source in self.keys.items()}
             if session.client is None:
                 session.client = await asyncio.to_thread(self._connect)
-            answer = await asyncio.to_thread(session.client.infer, self.named(obs))
+            answer = await asyncio.to_thread(session.client.infer, named)
             session.chunk.extend(answer["actions"][: self.chunk_size].astype(np.float32))
         await ctx.send_action({"actions": session.chunk.popleft()})
-
-    def named(self, obs: Mapping[str, Any]) -> dict[str, Any]:
-        """The benchmark's observation under the policy's keys. Raises ObservationError if something is missing."""
-        return {key: at(obs, source) for key, source in self.keys.items()}
 
     def get_observation_params(self) -> dict[str, Any]:
         return {"send_wrist_image": True, "send_state": True}  # benchmarks leave them out unless they are requested
@@ -117,7 +111,8 @@ class TurboPi(ModelServer):
         return {name: DimSpec(name, 0, form) for name, form in self.actions.items()} or {"actions": RAW}
 
 
-def at(obs: Mapping[str, Any], source: str) -> Any:
+def value_at(obs: Mapping[str, Any], source: str) -> Any:
+    """Raises ObservationError, naming what the benchmark sent, if there is nothing at `source`."""
     value: Any = obs
     for part in source.split("/"):
         if not isinstance(value, Mapping) or part not in value:

@@ -1,6 +1,6 @@
 """examples/vla_eval_server.py: a benchmark's observations to the policy's keys, chunks to actions, mistakes to errors.
 
-The first tests stand in for vla-evaluation-harness; the last runs its own client, server and LIBERO class.
+The last test runs vla-evaluation-harness's own client, server and LIBERO class; the others stand in for it.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from turbopi.serve import running
 EXAMPLE = Path(__file__).parents[1] / "examples" / "vla_eval_server.py"
 STATE = np.linspace(-1, 1, 8)
 IMAGE = np.arange(256 * 256 * 3, dtype=np.uint8).reshape(256, 256, 3)
-LIBERO = {  # as the harness's client sends it, with the parameters that the server requests
+LIBERO: dict[str, Any] = {  # as the harness's client sends it, with the parameters that the server requests
     "images": {"agentview": IMAGE, "wrist": IMAGE[::-1].copy()},
     "task_description": "put the bowl away",
     "states": STATE,
@@ -70,11 +70,11 @@ def episode(server: Any, *observations: dict[str, Any], start: bool = True) -> l
         sent.append(action["actions"])
 
     async def run() -> None:
-        ctx = SimpleNamespace(session_id="s", step=0, send_action=send_action)
+        ctx = SimpleNamespace(session_id="s", send_action=send_action)
         if start:
-            await server.on_episode_start({"task": {"name": "a task"}}, ctx)
+            await server.on_episode_start({}, ctx)
         try:
-            for ctx.step, observation in enumerate(observations):
+            for observation in observations:
                 await server.on_observation(observation, ctx)
         finally:
             await server.on_episode_end({}, ctx)
@@ -83,32 +83,17 @@ def episode(server: Any, *observations: dict[str, Any], start: bool = True) -> l
     return sent
 
 
-def test_a_benchmarks_observation_reaches_the_policy_under_its_keys(example: Any, policy: SimpleNamespace) -> None:
-    (action,) = episode(example.TurboPi(policy.url, chunk_size=2), LIBERO)
-    np.testing.assert_array_equal(action, STATE.astype(np.float32), strict=True)
-    got = policy.fake.observations["put the bowl away"]
-    assert set(got) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
-    np.testing.assert_array_equal(got["observation/image"], IMAGE)
-    np.testing.assert_array_equal(got["observation/wrist_image"], IMAGE[::-1])
-
-
-@pytest.mark.parametrize(("restart", "calls"), [(None, 2), (1, 2), (2, 2)])
+@pytest.mark.parametrize(("restart", "calls"), [(None, 2), (1, 2), (2, 2), (3, 3)])
 def test_a_chunk_lasts_until_it_is_used_up_or_the_instruction_changes(
     example: Any, policy: SimpleNamespace, restart: int | None, calls: int
 ) -> None:
-    """Of three steps with two actions a chunk; a skipped step of RoboTwin has no images, and needs none."""
-    steps: list[dict[str, Any]] = [LIBERO, {"task_description": "skipped"}, LIBERO]
+    """Of two actions a chunk. A step that needs no chunk needs no images: RoboTwin skips some."""
+    steps = [LIBERO, {"task_description": "skipped"}, LIBERO, {"task_description": "skipped"}]
     if restart is not None:
         steps[restart] = LIBERO | {"episode_restart": True}
-    assert len(episode(example.TurboPi(policy.url, chunk_size=2), *steps)) == 3
+    actions = episode(example.TurboPi(policy.url, chunk_size=2), *steps[: 3 if restart == 1 else 4])
     assert len(policy.fake.seen) == calls
-
-
-def test_an_episode_begins_with_a_chunk_of_its_own(example: Any, policy: SimpleNamespace) -> None:
-    server = example.TurboPi(policy.url, chunk_size=2)
-    for _ in range(2):
-        episode(server, LIBERO)
-    assert len(policy.fake.seen) == 2
+    np.testing.assert_array_equal(actions, [STATE.astype(np.float32)] * len(actions), strict=True)
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
@@ -119,32 +104,28 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_mistake_is_named_and_the_next_episode_runs(example: Any, policy: SimpleNamespace, case: str) -> None:
+def test_a_mistake_is_named_and_the_next_episode_has_a_chunk_of_its_own(
+    example: Any, policy: SimpleNamespace, case: str
+) -> None:
     wrong, text = BAD[case]
     server = example.TurboPi(policy.url, chunk_size=2)
+    assert len(episode(server, LIBERO)) == 1
     with pytest.raises(ObservationError, match=text):
         episode(server, LIBERO | wrong)
-    assert len(episode(server, LIBERO)) == 1
-
-
-def test_an_observation_outside_an_episode_is_refused(example: Any, policy: SimpleNamespace) -> None:
     with pytest.raises(ObservationError, match="before the start of an episode"):
-        episode(example.TurboPi(policy.url, chunk_size=2), LIBERO, start=False)
-
-
-@pytest.mark.parametrize("size", [0, 3])
-def test_more_actions_than_a_chunk_has_are_refused_at_the_start(
-    example: Any, policy: SimpleNamespace, size: int
-) -> None:
-    with pytest.raises(ConfigError, match=f"chunk_size is {size}; expected 1 to 2,"):
-        example.TurboPi(policy.url, chunk_size=size)
+        episode(server, LIBERO, start=False)
+    assert len(episode(server, LIBERO)) == 1 and len(policy.fake.seen) == 2
 
 
 @pytest.mark.parametrize(
     ("metadata", "text"),
-    [({"memory": {}}, "must see every step"), ({"real_time": {"execution": "rtc"}}, "serve without --execution")],
+    [
+        ({"action_horizon": 4}, "chunk_size is 5; expected 1 to 4,"),
+        ({"memory": {}}, "must see every step"),
+        ({"real_time": {"execution": "rtc"}}, "serve without --execution"),
+    ],
 )
-def test_a_policy_that_needs_more_than_chunks_is_refused_at_the_start(
+def test_a_policy_that_does_not_fit_is_refused_at_the_start(
     example: Any, monkeypatch: pytest.MonkeyPatch, metadata: dict[str, Any], text: str
 ) -> None:
     server = nullcontext(SimpleNamespace(metadata=metadata))
@@ -163,11 +144,10 @@ def test_a_lost_policy_is_the_observations_error_never_the_starts(example: Any) 
 
 
 def test_keys_of_ones_own_have_actions_of_ones_own(example: Any, policy: SimpleNamespace) -> None:
-    server = example.TurboPi(policy.url, chunk_size=2, keys={"observation/state": "joint_state"})
-    np.testing.assert_array_equal(episode(server, {"joint_state": STATE}), [STATE.astype(np.float32)])
-    assert server.get_action_spec() == {"actions": None}  # RAW: the harness warns that nobody said what they are
-    server = example.TurboPi(policy.url, chunk_size=2, keys={}, actions={"joints": "joint_positions"})
-    assert server.get_action_spec() == {"joints": ("joints", 0, "joint_positions")}
+    own = partial(example.TurboPi, policy.url, chunk_size=2, keys={"observation/state": "joint_state"})
+    assert len(episode(own(), {"joint_state": STATE})) == 1
+    assert own().get_action_spec() == {"actions": None}  # RAW: the harness warns that nobody said what they are
+    assert own(actions={"joints": "joint_positions"}).get_action_spec() == {"joints": ("joints", 0, "joint_positions")}
 
 
 @pytest.mark.slow
@@ -182,37 +162,31 @@ def test_the_harness_itself_runs_liberos_episodes(policy: SimpleNamespace) -> No
     from vla_eval.runners.sync_runner import SyncEpisodeRunner
     from vla_eval.specs import DimSpec, check_specs
 
-    raw = {
-        "agentview_image": IMAGE,
-        "robot0_eye_in_hand_image": IMAGE[::-1],
-        "robot0_eef_pos": STATE[:3],
-        "robot0_eef_quat": np.array([0.0, 0, 0, 1]),
-        "robot0_gripper_qpos": STATE[6:],
-    }
+    images = {"agentview_image": IMAGE, "robot0_eye_in_hand_image": IMAGE[::-1]}
+    quaternion = np.array([0.0, 0, 0, 1])
+    arm = {"robot0_eef_pos": STATE[:3], "robot0_eef_quat": quaternion, "robot0_gripper_qpos": STATE[6:]}
     carried_out: list[np.ndarray] = []
 
     class Simulator(LIBEROBenchmark):  # type: ignore[misc]
         def reset(self, task: dict[str, Any]) -> Any:
             controller = SimpleNamespace(ee_pos=np.zeros(3), ee_ori_mat=np.eye(3))
             self._env = SimpleNamespace(robots=[SimpleNamespace(controller=controller)])
-            return raw
+            return images | arm
 
         def step(self, action: dict[str, Any]) -> Any:
             carried_out.append(action["actions"])
-            return StepResult(obs=raw, reward=0.0, done=False, info={})
+            return StepResult(obs=images | arm, reward=0.0, done=False, info={})
 
     async def evaluate(url: str) -> None:
         connection = Connection(url)
         await connection.connect(benchmark="libero")
         about = connection.server_info
+        specs = {of: {name: DimSpec.from_dict(one) for name, one in about[of].items()} for of in about if "spec" in of}
         libero = Simulator(**about["observation_params"])
-        specs = [
-            {n: DimSpec.from_dict(one) for n, one in about[f"{k}_spec"].items()} for k in ("action", "observation")
-        ]
-        assert not check_specs(specs[0], libero.get_action_spec(), specs[1], libero.get_observation_spec())
-        for max_steps in (3, 2):
-            result = await SyncEpisodeRunner().run_episode(libero, {"name": "a task"}, connection, max_steps=max_steps)
-            assert result["steps"] == max_steps
+        sent, taken = specs["observation_spec"], specs["action_spec"]
+        assert not check_specs(taken, libero.get_action_spec(), sent, libero.get_observation_spec())
+        for steps in (3, 2):
+            await SyncEpisodeRunner().run_episode(libero, {"name": "a task"}, connection, max_steps=steps)
         await connection.start_episode({})
         with pytest.raises(RuntimeError, match=r"sent no 'images/agentview' but \['task_description'\]"):
             await connection.act({"task_description": "nothing else"})
@@ -220,12 +194,12 @@ def test_the_harness_itself_runs_liberos_episodes(policy: SimpleNamespace) -> No
 
     with anyio.from_thread.start_blocking_portal() as portal:
         server = load().TurboPi(policy.url, chunk_size=2)
-        serve = partial(serve_async, server, "127.0.0.1", 0)
-        task, port = portal.start_task(serve)
+        task, port = portal.start_task(partial(serve_async, server, "127.0.0.1", 0))
         asyncio.run(evaluate(f"ws://127.0.0.1:{port}"))
         task.cancel()
     got = policy.fake.observations["a task"]
     np.testing.assert_array_equal(got["observation/image"], IMAGE[::-1, ::-1])  # turned by the harness, once
+    np.testing.assert_array_equal(got["observation/wrist_image"], IMAGE[:, ::-1])
     expected = np.concatenate([STATE[:3], np.zeros(3), STATE[6:]])
     np.testing.assert_allclose(got["observation/state"], expected)
     np.testing.assert_allclose(carried_out, [expected] * 5, rtol=1e-6)
