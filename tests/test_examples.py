@@ -117,3 +117,10 @@ def test_recordings_become_fp8(tmp_path: Path) -> None:
 def test_the_python_api_shows_what_a_call_can_be_asked_for() -> None:
     shown = run("python_api.py")
     assert "warm after" in shown and "a batch of 2 chunks" in shown and "refused: the observation has no" in shown
+
+
+def test_the_model_server_of_vla_eval_says_that_no_policy_answers() -> None:
+    """It runs in test_vla_eval.py."""
+    pytest.importorskip("vla_eval", reason="pip install vla-eval, with its dependencies")
+    with pytest.raises(AssertionError, match=r"vla_eval_server\.py: no policy server at ws://127\.0\.0\.1:9"):
+        run("vla_eval_server.py", "--args.policy", "ws://127.0.0.1:9")

@@ -566,3 +566,17 @@ def test_the_documented_class_works(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_paths_that_lead_to_no_robot_are_refused(path: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         import_robot(path)
+
+
+def test_the_example_of_droid_by_joint_positions_reads_droids_keys() -> None:
+    """As Isaac Lab-Arena's client sends them, in float32; its checkpoints' joint actions are relative to the state."""
+    robot, droid = load_robot(FOLDER.parents[2] / "examples" / "droid_jointpos.json"), CREATED["droid"]
+    sent = droid.example(np.random.default_rng(0))
+    sent |= {key: value.astype(np.float32) for key, value in sent.items() if "position" in key}
+    ours, theirs = robot.inputs(sent), droid.inputs(sent)
+    assert (ours.image_mask, ours.prompt) == (theirs.image_mask, theirs.prompt)
+    for camera, image in theirs.images.items():
+        np.testing.assert_array_equal(ours.images[camera], image)
+    np.testing.assert_array_equal(ours.state, theirs.state)
+    assert robot.delta_mask == (True,) * 7 + (False,) and droid.delta_mask is None
+    assert robot.action_dim == droid.action_dim

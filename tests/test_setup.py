@@ -201,6 +201,7 @@ def test_the_extra_cuda_is_what_the_gpu_tests_ran_with() -> None:
 # --- what the fast tests need -----------------------------------------------------------------------------------------
 
 LEFT_OUT = {"lerobot", "libero", "modelopt", "mujoco", "openpi_client", "ray", "rerun", "robosuite", "tensorrt_rtx"}
+LEFT_OUT |= {"vla_eval"}
 FILES = [*(ROOT / "tests").glob("test_*.py"), *(ROOT / "packages/turbopi-lab/tests").glob("test_*.py")]
 
 
