@@ -204,6 +204,7 @@ def test_errors_are_objects_with_a_websockets_text(body: Any, status: int, kind:
     [
         ({"Content-Length": ""}, 411),
         ({"Content-Length": "", "Transfer-Encoding": "chunked"}, 411),
+        ({"Transfer-Encoding": "chunked"}, 411),  # and a length: which of them a proxy went by, nobody knows
         ({"Content-Length": "1000000000"}, 413),
         ({"Content-Length": "9" * 20}, 413),
         ({"Content-Length": "-1"}, 400),
@@ -325,6 +326,15 @@ def test_a_server_that_stops_answers_what_it_computes() -> None:
         await stopping
 
     asyncio.run(asyncio.wait_for(main(), 60))
+
+
+def test_images_take_no_more_memory_than_a_websockets_message() -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        large = data_url(np.zeros((1400, 1000, 3), np.uint8))  # 4.2 MB, of a default of 64
+        assert "1000 x 1400 pixels; at most 1398" in (await error_of(server, {**JSON_OBSERVATION, "i": large}))[2]
+        assert (await post(server, {**JSON_OBSERVATION, "i": large, "padding": " " * 4_300_000}))[0] == 200
+
+    served(test)
 
 
 # --- documents --------------------------------------------------------------------------------------------------------

@@ -222,7 +222,7 @@ class Post(asyncio.Protocol):
             return self._refuse(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "this server speaks HTTP/1.1 alone")
         if request.target.partition(b"?")[0] != ACTIONS.encode():
             return self._refuse(HTTPStatus.NOT_FOUND, f"POST goes to {ACTIONS} alone")
-        if b"content-length" not in found:
+        if b"content-length" not in found or b"transfer-encoding" in found:
             return self._refuse(HTTPStatus.LENGTH_REQUIRED, "the body needs a Content-Length; chunks aren't read")
         if kind not in (JSON, *MSGPACK) or b"content-encoding" in found:
             text = f"the Content-Type is {kind[:80]!r}; it should be {JSON} or {MSGPACK[0]}, without a Content-Encoding"
@@ -286,9 +286,11 @@ class Post(asyncio.Protocol):
         """The connection's message as msgpack. What is wrong with it is raised where msgpack's faults are."""
         if self._type != JSON or isinstance(message, str):
             return message
-        started = time.perf_counter()
+        started, limits = time.perf_counter(), self._shared.limits
+        # A few kB of PNG may be gigabytes: images take no more than the memory that the message has already.
+        most = min(limits.message_bytes, max(limits.free_bytes, len(message)))
         try:
-            return await self._loop.run_in_executor(_reader, from_json, message, self._shared.limits.message_bytes)
+            return await self._loop.run_in_executor(_reader, from_json, message, most)
         except ObservationError as error:
             self._connection.unpacker = _Unreadable(error)
             return b""
