@@ -350,10 +350,10 @@ def test_the_schema_has_the_policys_keys_and_shapes_and_fits_a_request() -> None
     parts = made["components"]["schemas"]
     for part in parts.values():
         validator.check_schema(part)
-    told = {**from_example(example), "turbopi/deadline_ms": 100}
+    request = {**from_example(example), "turbopi/deadline_ms": 100}
     assert parts["Observation"]["properties"]["state"]["description"] == "x m, grip"
-    assert validator(parts["Observation"]).is_valid(told)
-    assert not validator(parts["Observation"]).is_valid({**told, "state": [1.0]})
+    assert validator(parts["Observation"]).is_valid(request)
+    assert not validator(parts["Observation"]).is_valid({**request, "state": [1.0]})
     assert validator(parts["Answer"]).is_valid({"actions": [[0.0, 1.0]] * 3, "server_timing": {"infer_ms": 1.0}})
     assert validator(parts["Error"]).is_valid({"error": {"kind": "busy", "text": "busy"}})
     references = {value for value in strings(made) if value.startswith("#/")}

@@ -75,7 +75,7 @@ class Gate:
             return self._unauthorized(connection, request)
         if path == "/metrics":
             return self._document(connection, request, CONTENT_TYPE, self._metrics.text())
-        if path in self.documents:
+        if path in self.documents and not request.headers.get_all("Upgrade"):
             return self._document(connection, request, "application/json", self.documents[path])
         host = _only(request, "Host")
         for origin in request.headers.get_all("Origin"):  # of browsers, always; most robots send none

@@ -161,7 +161,7 @@ class Post(asyncio.Protocol):
         # The other end of the connection's websocket.
         self._client = ClientProtocol(parse_uri(f"ws://localhost{ACTIONS}"), max_size=None, logger=connection.logger)
         self._type, self._length = JSON, 0
-        self._asked = self._greeted = self._responded = self._ended = self._passed_on = False
+        self._requested = self._greeted = self._responded = self._ended = self._passed_on = False
         self._holds, self._wanted = False, True  # reading: by this class, by the connection
         self._timer: asyncio.TimerHandle | None = None
         connection.transport = _Link(self, self._socket)
@@ -196,7 +196,7 @@ class Post(asyncio.Protocol):
     def _advance(self) -> None:
         """Hand on what has come of the request."""
         while not self._ended:
-            if self._asked and self._client.state is State.CONNECTING:  # the gate hasn't decided yet
+            if self._requested and self._client.state is State.CONNECTING:  # the gate hasn't decided yet
                 return self._hold(True)
             try:
                 event = self._http.next_event()
@@ -210,8 +210,6 @@ class Post(asyncio.Protocol):
                 self._begin(event)
             elif isinstance(event, h11.Data):
                 self._connection.data_received(bytes(event.data))
-            else:  # the body's end
-                self._pong()
         return None
 
     def _begin(self, request: h11.Request) -> None:
@@ -227,7 +225,7 @@ class Post(asyncio.Protocol):
         if kind not in (JSON, *MSGPACK) or b"content-encoding" in found:
             text = f"the Content-Type is {kind[:80]!r}; it should be {JSON} or {MSGPACK[0]}, without a Content-Encoding"
             return self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, text)
-        self._type, self._asked = kind, True
+        self._type, self._requested = kind, True
         # A frame beyond the limit is refused by its header, whatever it says.
         self._length = min(int(found[b"content-length"]), self._shared.limits.message_bytes + 1)
         host = self._socket.get_extra_info("peername")
@@ -242,7 +240,7 @@ class Post(asyncio.Protocol):
                 value = b"Api-Key " + key
             knock.headers[name.decode("latin-1")] = value.decode("latin-1")
         self._client.send_request(knock)
-        return self._to_connection()
+        return self._connection.data_received(b"".join(self._client.data_to_send()))
 
     # --- from the connection ------------------------------------------------------------------------------------------
 
@@ -263,8 +261,6 @@ class Post(asyncio.Protocol):
                 self.end()
             elif isinstance(event, Frame):
                 self._frame(event)
-        if self._http.their_state is h11.DONE:
-            self._loop.call_soon(self._pong)
 
     def _frame(self, frame: Frame) -> None:
         if frame.opcode is Opcode.CLOSE:
@@ -309,10 +305,11 @@ class Post(asyncio.Protocol):
         if self._ended:  # the client takes too long to read why
             self._socket.abort()
             return
-        if not self._asked:
+        if not self._requested:
             self._error(HTTPStatus.REQUEST_TIMEOUT, "slow", "the request's head took too long")
         elif self._client.state is State.CONNECTING:
-            self._error(HTTPStatus.BAD_REQUEST, "malformed", "bad request: a header can't be read")
+            status = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE  # websockets before 17 doesn't say so
+            self._error(status, "malformed", "bad request: the headers are too many or too long")
         self._error(FAILED[1], FAILED[0], FAILED[2])
         self.end()
 
@@ -354,16 +351,6 @@ class Post(asyncio.Protocol):
             self._socket.pause_reading()
         else:
             self._socket.resume_reading()
-
-    def _pong(self) -> None:
-        """Answer the pings that came; not inside of the body's frame."""
-        if not self._ended:
-            self._to_connection()
-
-    def _to_connection(self) -> None:
-        data = b"".join(self._client.data_to_send())
-        if data:
-            self._connection.data_received(data)
 
     def _write(self, *events: h11.InformationalResponse | h11.Response | h11.Data | h11.EndOfMessage) -> None:
         data = b"".join(self._http.send(event) or b"" for event in events)
