@@ -32,14 +32,11 @@ def served(test: Callable[[PolicyServer, Any], Awaitable[None]], policy: Any = N
     async def main() -> None:
         async with PolicyServer(policy, port=0, **options) as server:
             await test(server, policy)
-            assert (await post(server, JSON_OBSERVATION, **options_key(options)))[0] == 200  # whatever came before
+            assert (await post(server, JSON_OBSERVATION, headers={"Authorization": "Bearer right"}))[
+                0
+            ] == 200  # whatever came before
 
     asyncio.run(asyncio.wait_for(main(), 60))
-
-
-def options_key(options: dict[str, Any]) -> dict[str, Any]:
-    key = options.get("api_key")
-    return {} if key is None else {"headers": {"Authorization": f"Bearer {key}"}}
 
 
 def data_url(image: np.ndarray, kind: str = "png") -> str:
@@ -221,18 +218,11 @@ def test_errors_are_objects_with_a_websockets_text(body: Any, status: int, kind:
 )
 def test_broken_requests_are_refused_before_their_body(headers: dict[str, str], status: int) -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
-        found, fields, body = await exchange(server, wire_of(JSON_OBSERVATION, headers))
+        wire = wire_of(JSON_OBSERVATION, headers)
+        found, fields, body = await exchange(server, wire)
         assert found == status and fields["connection"] == "close" and json.loads(body)["error"]["text"]
-
-    served(test)
-
-
-def test_other_addresses_and_versions_are_refused() -> None:
-    async def test(server: PolicyServer, policy: FakePolicy) -> None:
-        assert (await error_of(server, {}, target="/v1/action"))[0] == 404
-        wire = wire_of(JSON_OBSERVATION)
-        assert (await exchange(server, wire.replace(b"HTTP/1.1", b"HTTP/1.0")))[0] == 505
-        assert (await exchange(server, wire.replace(b"Host", b"Host: a\r\nHost")))[0] == 400
+        assert (await exchange(server, wire.replace(b"HTTP/1.1", b"HTTP/1.0")))[0] >= 400
+        assert (await exchange(server, wire.replace(b"/v1/actions", b"/v1/action")))[0] >= 400
 
     served(test)
 
@@ -252,17 +242,20 @@ def test_the_key_is_needed_as_bearer_or_as_openpi_sends_it() -> None:
     served(test, api_key="right")
 
 
-def test_a_message_above_the_limit_and_an_image_that_grows_beyond_it_are_refused() -> None:
-    bomb = data_url(np.zeros((2000, 2000, 3), np.uint8))  # 12 MB in 50 kB
+def test_a_message_and_its_images_take_no_more_memory_than_a_websockets() -> None:
+    large = data_url(np.zeros((1400, 1000, 3), np.uint8))  # 4.2 MB in 10 kB
 
-    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+    async def small(server: PolicyServer, policy: FakePolicy) -> None:
         assert (await error_of(server, b" " * 2**20 + b"{}"))[:2] == (413, "too_large")
-        assert "at most 349525" in (await error_of(server, {"i": bomb}))[2]
-        assert (
-            "at most 174933" in (await error_of(server, {"i": [data_url(np.zeros((512, 341, 3), np.uint8)), bomb]}))[2]
-        )
+        few = data_url(np.zeros((512, 341, 3), np.uint8))
+        assert "at most 174933 are read" in (await error_of(server, {"i": [few, large]}))[2]
 
-    served(test, max_message_mb=1)
+    async def usual(server: PolicyServer, policy: FakePolicy) -> None:
+        assert "at most 1398" in (await error_of(server, {**JSON_OBSERVATION, "i": large}))[2]
+        assert (await post(server, {**JSON_OBSERVATION, "i": large, "more": " " * 4_300_000}))[0] == 200
+
+    served(small, max_message_mb=1)
+    served(usual)
 
 
 def test_half_requests_are_cut_and_say_so() -> None:
@@ -326,15 +319,6 @@ def test_a_server_that_stops_answers_what_it_computes() -> None:
         await stopping
 
     asyncio.run(asyncio.wait_for(main(), 60))
-
-
-def test_images_take_no_more_memory_than_a_websockets_message() -> None:
-    async def test(server: PolicyServer, policy: FakePolicy) -> None:
-        large = data_url(np.zeros((1400, 1000, 3), np.uint8))  # 4.2 MB, of a default of 64
-        assert "1000 x 1400 pixels; at most 1398" in (await error_of(server, {**JSON_OBSERVATION, "i": large}))[2]
-        assert (await post(server, {**JSON_OBSERVATION, "i": large, "padding": " " * 4_300_000}))[0] == 200
-
-    served(test)
 
 
 # --- documents --------------------------------------------------------------------------------------------------------
