@@ -2,8 +2,10 @@
 
 import asyncio
 import base64
+import contextlib
 import io
 import json
+import random
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -211,6 +213,7 @@ def test_errors_are_objects_with_a_websockets_text(body: Any, status: int, kind:
         ({"X-A": "a" * 20_000}, 431),
         ({"X-A": "a" * 9000}, 431),
         ({"X-A": "\0"}, 400),
+        ({"X-A": "\x05"}, 400),
         ({"Host": ""}, 400),
         ({"Origin": "http://evil.example"}, 403),
         ({"Host": "evil.example", "Origin": "http://evil.example"}, 403),
@@ -319,6 +322,33 @@ def test_a_server_that_stops_answers_what_it_computes() -> None:
         await stopping
 
     asyncio.run(asyncio.wait_for(main(), 60))
+
+
+def test_damaged_posts_in_pieces_end_their_own_socket_at_most(caplog: pytest.LogCaptureFixture) -> None:
+    chance = random.Random(4)
+    whole = [wire_of(JSON_OBSERVATION), wire_of(pack(OBSERVATION), PACKED), wire_of(b"{")]
+
+    async def damaged(server: PolicyServer) -> None:
+        wire = bytearray(b"".join(chance.choices(whole, k=chance.choice((1, 2)))))
+        for _ in range(chance.choice((0, 1, 3))):
+            at = chance.randrange(160 if chance.random() < 0.6 else len(wire))
+            wire[at : at + chance.choice((0, 1, 20))] = chance.randbytes(chance.choice((0, 1, 5)))
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        for at in range(0, len(wire), piece := chance.choice((50, 10**6))):
+            writer.write(wire[at : at + piece])
+            await asyncio.sleep(0)
+        if chance.random() < 0.3:
+            writer.transport.abort()
+        with contextlib.suppress(OSError):
+            assert b"Traceback" not in await reader.read()
+        writer.close()
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        await asyncio.gather(*(damaged(server) for _ in range(150)))
+        assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+    free: dict[str, Any] = {"work_burst": 1e6, "work_rate": 1e6, "work_total_rate": 1e6, "connections_rate": 1e4}
+    served(test, limits=Limits(handshake_seconds=0.5, message_seconds=0.5, close_seconds=0.5, **free))
 
 
 # --- documents --------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ name, and has what is left of its credit.
 """
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from typing import Any, Literal
 import h11
 import msgspec
 from websockets.client import ClientProtocol
+from websockets.exceptions import InvalidHandshake
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Response
 from websockets.protocol import State
@@ -238,7 +240,10 @@ class Post(asyncio.Protocol):
             scheme, _, key = value.partition(b" ")
             if name == b"authorization" and scheme.lower() == b"bearer":
                 value = b"Api-Key " + key
-            knock.headers[name.decode("latin-1")] = value.decode("latin-1")
+            try:
+                knock.headers[name.decode("latin-1")] = value.decode("latin-1")
+            except InvalidHandshake as error:  # a control character, which h11 lets pass
+                return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         self._client.send_request(knock)
         return self._connection.data_received(b"".join(self._client.data_to_send()))
 
@@ -326,7 +331,7 @@ class Post(asyncio.Protocol):
             self._socket.close()
         else:  # a socket that is closed before all of it is read may lose the response
             self._timer = self._loop.call_later(self._shared.limits.close_seconds, self._socket.abort)
-            if self._socket.can_write_eof():
+            with contextlib.suppress(OSError, RuntimeError):  # the client has left
                 self._socket.write_eof()
             self._socket.resume_reading()
 
