@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import contextlib
+import errno
 import io
 import json
 import random
@@ -349,6 +350,21 @@ def test_damaged_posts_in_pieces_end_their_own_socket_at_most(caplog: pytest.Log
 
     free: dict[str, Any] = {"work_burst": 1e6, "work_rate": 1e6, "work_total_rate": 1e6, "connections_rate": 1e4}
     served(test, limits=Limits(handshake_seconds=0.5, message_seconds=0.5, close_seconds=0.5, **free))
+
+
+def test_a_client_that_has_left_when_it_is_refused_is_no_fault_of_the_server(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def not_connected(self: object) -> None:
+        raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
+
+    monkeypatch.setattr("asyncio.selector_events._SelectorSocketTransport.write_eof", not_connected)
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        assert (await exchange(server, wire_of(JSON_OBSERVATION)[:-1]))[0] == 408
+        assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+    served(test, limits=Limits(message_seconds=0.2))
 
 
 # --- documents --------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ name, and has what is left of its credit.
 
 import asyncio
 import contextlib
+import re
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +22,6 @@ from typing import Any, Literal
 import h11
 import msgspec
 from websockets.client import ClientProtocol
-from websockets.exceptions import InvalidHandshake
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Response
 from websockets.protocol import State
@@ -64,6 +64,7 @@ KINDS = sorted(
 )
 
 _POST = b"POST /v1/"
+_CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f\x7f]")
 _OWN_HEADERS = (b"connection", b"upgrade", b"expect", b"te", b"trailer", b"keep-alive", b"proxy-connection")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="turbopi-json")  # one body at a time, beside the event loops
 
@@ -240,10 +241,9 @@ class Post(asyncio.Protocol):
             scheme, _, key = value.partition(b" ")
             if name == b"authorization" and scheme.lower() == b"bearer":
                 value = b"Api-Key " + key
-            try:
-                knock.headers[name.decode("latin-1")] = value.decode("latin-1")
-            except InvalidHandshake as error:  # a control character, which h11 lets pass
-                return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            if _CONTROL.search(value):  # which h11 lets pass
+                return self._refuse(HTTPStatus.BAD_REQUEST, f"a control character in the header {name[:80]!r}")
+            knock.headers[name.decode("latin-1")] = value.decode("latin-1")
         self._client.send_request(knock)
         return self._connection.data_received(b"".join(self._client.data_to_send()))
 
