@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any, get_args
 
@@ -459,6 +460,26 @@ def test_a_server_says_how_it_joins_in_one_line(options: dict[str, Any], words: 
 
 
 # --- through a socket -------------------------------------------------------------------------------------------------
+
+
+def test_posts_join_chunks_in_a_named_session_and_need_one() -> None:
+    with running(Joins(), execution="rtc", control_hz=50) as server:
+        client = HTTPConnection("127.0.0.1", server.port)
+
+        def post(**more: Any) -> dict[str, Any]:
+            body = json.dumps({"place": 0.0, **{f"turbopi/{key}": value for key, value in more.items()}})
+            client.request("POST", "/v1/actions", body, {"Content-Type": "application/json"})
+            answer: dict[str, Any] = json.loads(client.getresponse().read())
+            return answer
+
+        for _ in range(2):
+            assert "a POST needs turbopi/session here" in post(step=1)["error"]["text"]
+        assert post(session="arm", step=1)["real_time"]["joined"] is False
+        client.close()  # the session isn't the connection's
+        joined = post(session="arm", step=3)["real_time"]
+        assert (joined["joined"], joined["row"], joined["row_by"]) == (True, 2, "step")
+        assert post(mode="none", session="arm")["actions"]
+        client.close()
 
 
 @pytest.fixture

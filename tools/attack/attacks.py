@@ -153,6 +153,14 @@ ATTACKS: dict[str, Attack] = {
             _on_a_server(Siege(), floods.refusals),
         ),
         Attack(
+            "posts",
+            "8 clients' POSTs of many numbers, of images that grow a thousandfold, each with a fault",
+            "the credit of a socket goes on from POST to POST: within 1.5 ×",
+            Size(),
+            0.5,
+            _on_a_server(Siege(), floods.posts),
+        ),
+        Attack(
             "pings_unread",
             "pings as fast as they are taken, pongs never read",
             "the server stops reading who doesn't read: a few MB stay",

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from attack.arena import Arena
-from attack.websocket import request
+from attack.websocket import post, request
 
 KEY = "attack-key"
 PATIENCE_S = 30.0
@@ -104,6 +104,21 @@ def knocks(port: int) -> Iterator[Knock]:
     yield Knock("websocket version 8", request(port, AUTHORIZED).replace(b"Version: 13", b"Version: 8"), (400, 426))
     yield Knock("extensions", request(port, AUTHORIZED, "Sec-WebSocket-Extensions: permessage-deflate; x=1"), IN)
     yield Knock("strange extensions", request(port, AUTHORIZED, "Sec-WebSocket-Extensions: ;;;,,="), (*IN, *OUT))
+    body = b'{"observation/state": [0.5]}'
+    for name, status, headers in (
+        ("no key", 401, ()),
+        ("wrong key", 401, ("Authorization: Bearer x",)),
+        ("key", 200, (f"Authorization: Bearer {KEY}",)),
+        ("evil origin", 403, (AUTHORIZED, "Origin: http://evil.example")),
+        ("chunks", 411, (AUTHORIZED, "Transfer-Encoding: chunked")),
+        ("a huge header", 431, (AUTHORIZED, "X-A: " + "a" * 200_000)),
+        ("an upgrade", 200, (AUTHORIZED, "Connection: Upgrade", "Upgrade: websocket")),
+    ):
+        yield Knock(f"POST, {name}", post(port, "application/json", body, *headers), (status,))
+    long = post(port, "application/json", b"", AUTHORIZED).replace(b"Length: 0", b"Length: 1000000000")
+    yield Knock("POST of a gigabyte", long, (413,))
+    yield Knock("POST elsewhere", post(port, "application/json", b"{}", AUTHORIZED, path="/v1/x"), (404,))
+    yield Knock("half a POST", post(port, "application/json", b"{}", AUTHORIZED)[:-1], ())
     yield Knock("half a request line", b"GET / HT", ())
     yield Knock("half a header", request(port, AUTHORIZED)[:-10], ())
     yield Knock("nothing", b"", ())

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from attack.arena import Arena
 from attack.judging import TRACEBACK
 from attack.messages import observation
-from attack.websocket import PING, HandshakeRefused, Raw, frame, header, request
+from attack.websocket import PING, HandshakeRefused, Raw, frame, header, post, request
 from turbopi.realtime.wire import pack
 
 SLOW_WALK = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19998  # as many values as a message may have: the most work a byte
@@ -119,6 +119,36 @@ async def refusals(arena: Arena) -> None:
     """Observations that no decoder takes, small and different: each might become a line of the log."""
     wire = b"".join(frame(pack(observation(arena.random)) + b"\xc0") for _ in range(50))
     await _attackers(arena, 4, lambda: _flood(arena, wire, 50, 1000))
+
+
+async def posts(arena: Arena) -> None:
+    """POSTs that are much work and come to nothing: many numbers, images that grow a thousandfold, then a fault."""
+    import base64
+    import io
+
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.new("RGB", (1100, 1100)).save(stream, "png")
+    image = b'{"a": "data:image/png;base64,' + base64.b64encode(stream.getvalue()) + b'", "b": [{}]}'
+    bodies = (b'{"a": [' + b"0.1," * 19_000 + b"1]", image, b"{", b"")
+    wires = [post(arena.port, "application/json", body) for body in bodies]
+
+    async def one() -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", arena.port)
+        try:
+            while True:
+                writer.write(arena.random.choice(wires))
+                arena.found.count += 1
+                head = await reader.readuntil(b"\r\n\r\n")
+                length = int(head.lower().partition(b"content-length: ")[2].partition(b"\r\n")[0])
+                if TRACEBACK.encode() in await reader.readexactly(length):
+                    arena.found.violate("a traceback in a response", arena_line(arena))
+                arena.found.outcomes[f"HTTP {head[9:12].decode()}"] += 1
+        finally:
+            writer.transport.abort()
+
+    await _attackers(arena, 8, one)
 
 
 async def pings_unread(arena: Arena) -> None:

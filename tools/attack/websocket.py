@@ -66,6 +66,12 @@ def request(port: int, *headers: str, host: str = "127.0.0.1", path: str = "/") 
     return "\r\n".join(lines).encode()
 
 
+def post(port: int, kind: str, body: bytes, *headers: str, path: str = "/v1/actions") -> bytes:
+    """A request over HTTP alone."""
+    lines = [f"POST {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Content-Type: {kind}", *headers]
+    return "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""]).encode("latin-1") + body
+
+
 @dataclass
 class Raw:
     """One websocket connection. Use `await Raw.open(port)`; `greeting` is the metadata's message."""

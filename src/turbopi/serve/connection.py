@@ -103,7 +103,9 @@ class _Message:
 class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
     """One client. `answered` must be called for each message that `recv` gave, once it is dealt with."""
 
-    def __init__(self, protocol: ServerProtocol, owner: Owner, shared: Shared) -> None:
+    posted = ""  # "HTTP" and the host, if it carries one POST and ends with it (http_api.py)
+
+    def __init__(self, protocol: ServerProtocol, owner: Owner, shared: Shared, credit: Credit | None = None) -> None:
         limits = shared.limits
         super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
         self.bad_in_a_row = 0
@@ -112,7 +114,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self.unpacker = Unpacker()  # of its messages
         self.watch, self.batch_watch = Watch(), Watch(remembers=False)  # of its robot; of the rows of batch messages
         self._owner, self._shared, self._limits = owner, shared, limits
-        self._credit = Credit(limits, shared.pool, shared.clock)
+        self._credit = Credit(limits, shared.pool, shared.clock) if credit is None else credit
         self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on
         self._backlog: bytes | memoryview = b""  # received and not handed over yet
         self._payload_left = 0  # bytes of the current frame's payload that are still to come

@@ -51,6 +51,7 @@ class Gate:
         self._metrics, self._hosts, self._has_page = metrics, hosts, has_page
         self._why_lost, self._why_unwell = why_lost, why_unwell
         self._log = LimitedLog(logger)
+        self.documents: dict[str, str] = {}  # JSON by path, once there is any
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
@@ -73,7 +74,9 @@ class Gate:
         if not self._authorized(request):
             return self._unauthorized(connection, request)
         if path == "/metrics":
-            return self._metrics_page(connection, request)
+            return self._document(connection, request, CONTENT_TYPE, self._metrics.text())
+        if path in self.documents and not request.headers.get_all("Upgrade"):
+            return self._document(connection, request, "application/json", self.documents[path])
         host = _only(request, "Host")
         for origin in request.headers.get_all("Origin"):  # of browsers, always; most robots send none
             if host is None or not self._hosts.lets_in(origin, host, request.headers):
@@ -87,12 +90,12 @@ class Gate:
         """Say at the end how many lines of the log were left out and not said yet."""
         self._log.flush()
 
-    def _metrics_page(self, connection: ServerConnection, request: Request) -> Response:
+    def _document(self, connection: ServerConnection, request: Request, kind: str, text: str) -> Response:
         host = _only(request, "Host")
         if self._key is None and (host is None or not self._hosts.has(host)):
             # A page's GET of its own origin has no Origin, so a rebound name shows in Host alone
-            return self._forbidden(connection, f"/metrics is not for {_short(host)}")
-        return _found(connection, {"Content-Type": CONTENT_TYPE}, self._metrics.text())
+            return self._forbidden(connection, f"{path_of(request)} is not for {_short(host)}")
+        return _found(connection, {"Content-Type": kind}, text)
 
     def _page(self, connection: ServerConnection, request: Request) -> Response:
         host = _only(request, "Host")

@@ -14,8 +14,9 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from turbopi.serve.connection import GuardedConnection, Shared
+from turbopi.serve.http_api import PortConnection
 from turbopi.serve.limited_log import peer
-from turbopi.serve.limits import SPARE_CONNECTIONS, AtMost, room_for_connections, trim_memory
+from turbopi.serve.limits import SPARE_CONNECTIONS, AtMost, Credit, room_for_connections, trim_memory
 from turbopi.serve.page.http import is_feed, select_subprotocol
 
 logger = logging.getLogger(__name__)
@@ -163,12 +164,12 @@ class Listener:
         self._shared.log.warning(text, "full")
         return f"{text}\n"
 
-    def _new_connection(self) -> GuardedConnection:
+    def _new_connection(self, credit: Credit | None = None) -> PortConnection:
         # No compression: images don't get smaller, only slower.
         protocol = ServerProtocol(
             max_size=self._shared.limits.message_bytes, select_subprotocol=select_subprotocol, logger=_protocol_logger
         )
-        return GuardedConnection(protocol, self, self._shared)
+        return PortConnection(protocol, self, self._shared, self._new_connection, credit)
 
     def connected(self, connection: GuardedConnection) -> None:
         """A TCP connection has begun."""

@@ -281,7 +281,13 @@ class RequestHandler:
         connection.robot = read_robot(received) or connection.robot
         if scheduling.batch is None:
             plan = self._real_time.plan(received, connection)
-            connection.robot = connection.robot or plan.name or ""
+            connection.robot = connection.robot or plan.name or connection.posted
+            if connection.posted and plan.name is None and (plan.session or self._histories):
+                self._real_time.release(plan)
+                raise ObservationError(
+                    f"a POST needs {PREFIX}session here: this server goes on from a robot's earlier requests, and each "
+                    "POST is a connection of its own"
+                )
             if self._histories is not None:
                 try:
                     self._histories.begin(plan, connection)

@@ -42,6 +42,7 @@ from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.memory import Histories
 from turbopi.serve.metrics import Metrics
+from turbopi.serve.openapi import documents
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.page.http import is_feed
 from turbopi.serve.page.live import Live
@@ -174,6 +175,7 @@ class PolicyServer:
             await self._calls.warm_up(**({} if execution is None else {"real_time": execution}))
             metadata = {**self._policy.metadata, **self._real_time.metadata}
             self._greeting = pack(metadata)
+            self._gate.documents = documents(metadata, self._policy)
             if self._record_dir is not None:
                 keeps = self.options.record_limit
                 self._recorder = Recorder(
@@ -288,19 +290,19 @@ class PolicyServer:
             self._live.connected(connection)
         how = ""
         self.metrics.clients.inc()
-        self._log.info(f"{peer(connection)} connected", "connections")
+        self._came_or_went(connection, "connected")
         try:
             await connection.send(self._greeting)
             await self._converse(connection)
         except ClientLeft:
             self.metrics.error("disconnected")
             how = "it left during its request"
-            self._log.info(f"{peer(connection)} left during its request", "connections")
+            self._came_or_went(connection, how.removeprefix("it "))
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.metrics.error("too_large")
             how = _said(closed)
-            self._log.info(f"{peer(connection)} disconnected{how and f': {how}'}", "connections")
+            self._came_or_went(connection, f"disconnected{how and f': {how}'}")
         except PolicyFailed as failure:
             await self._fail(connection, str(failure))
         except Exception:  # a fault of this server must cost one client, not all
@@ -314,6 +316,10 @@ class PolicyServer:
             self.metrics.clients.dec()
             if self._live is not None:
                 self._live.disconnected(connection, how)
+
+    def _came_or_went(self, connection: GuardedConnection, how: str) -> None:
+        if not connection.posted:  # each POST would
+            self._log.info(f"{peer(connection)} {how}", "connections")
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""

@@ -26,14 +26,16 @@ def read_image(file: str | Path) -> np.ndarray:
         return decode_image(stream, file)
 
 
-def decode_image(stream: IO[bytes], name: object) -> np.ndarray:
-    """The image in an open file, as `read_image`; `name` begins the messages."""
+def decode_image(
+    stream: IO[bytes], name: object, *, most: int = MAX_PIXELS, formats: tuple[str, ...] = IMAGE_FORMATS
+) -> np.ndarray:
+    """The image in an open file, as `read_image`, of at most `most` pixels; `name` begins the messages."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # refused below
-            image = Image.open(stream, formats=IMAGE_FORMATS)
-        if image.width * image.height > MAX_PIXELS:
-            raise ObservationError(f"{name} has {image.width} x {image.height} pixels; at most {MAX_PIXELS} are read")
+            image = Image.open(stream, formats=formats)
+        if image.width * image.height > most:
+            raise ObservationError(f"{name} has {image.width} x {image.height} pixels; at most {most} are read")
         if image.mode not in _MODES:
             raise ObservationError(f"{name} has pixels of mode {image.mode}; expected 8 bits a channel, such as RGB")
         return np.array(image.convert("RGB"))
@@ -42,5 +44,5 @@ def decode_image(stream: IO[bytes], name: object) -> np.ndarray:
     except Exception as reason:  # damage makes Pillow's decoders raise a dozen classes
         why = " ".join(str(reason).split())[:200].replace(repr(stream), "it")
         raise ObservationError(
-            f"{name} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(IMAGE_FORMATS)
+            f"{name} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(formats)
         ) from reason
