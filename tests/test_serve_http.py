@@ -17,6 +17,7 @@ from serve_fakes import OBSERVATION, FakePolicy, http_get
 from websockets.asyncio.client import connect
 
 from turbopi.realtime.messages import KEYS
+from turbopi.realtime.shared_memory import HEADER, WANTED
 from turbopi.realtime.wire import MAX_VALUES, WireError, pack, unpack
 from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer
@@ -114,6 +115,15 @@ def test_json_and_msgpack_get_what_a_websocket_gets() -> None:
             assert getattr(now[key], "dtype", None) == getattr(value, "dtype", None)
         metrics = server.metrics.text()
         assert "turbopi_requests_total 3.0" in metrics and "turbopi_clients 0.0" in metrics
+
+    served(test)
+
+
+def test_a_post_that_asks_for_shared_memory_gets_none() -> None:
+    async def test(server: PolicyServer, _: Any) -> None:
+        for _ in range(2):
+            status, headers, _ = await exchange(server, wire_of(pack(OBSERVATION), {**PACKED, HEADER: WANTED}))
+            assert status == 200 and HEADER.lower() not in headers and server._listener._shared.slots == 0
 
     served(test)
 
