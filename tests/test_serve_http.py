@@ -452,3 +452,11 @@ def test_json_becomes_the_message_it_means() -> None:
 def test_an_answer_that_is_no_json_becomes_some() -> None:
     answer = {"a": np.array([np.nan, 1]), "b": np.float32(2), "c": 1j, "d": float("inf")}
     assert json.loads(to_json(answer)) == {"a": [None, 1.0], "b": 2.0, "c": "1j", "d": None}
+
+
+@pytest.mark.parametrize("features", ["none", {"state": {"dtype": "float32"}, "actions": [{"name": 3}]}])
+def test_the_schema_of_a_policy_of_another_make_lacks_what_it_does_not_tell(features: Any) -> None:
+    metadata = {"features": features, "action_horizon": "ten", "robot_action_dim": 7}
+    made = schema(metadata, {"state": np.zeros(3)})
+    answer = made["components"]["schemas"]["Answer"]["properties"]["actions"]
+    assert "minItems" not in answer and answer["items"]["minItems"] == 7 and json.dumps(made)

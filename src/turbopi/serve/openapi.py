@@ -12,6 +12,7 @@ from turbopi.serve.json_messages import to_json
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
 from turbopi.serve.requests import MAX_BATCH_ROWS
 from turbopi.serve.scheduling.schedule import PRIORITIES
+from turbopi.support.action_groups import names_of
 from turbopi.version import turbopi_version
 
 _TEXT, _YES, _NUMBER = {"type": "string"}, {"type": "boolean"}, {"type": "number"}
@@ -116,26 +117,36 @@ def _value(value: Any, metadata: Mapping[str, Any]) -> dict[str, Any]:
             "pattern": "^data:image/(png|jpeg);base64,",
             "description": "an RGB image, PNG or JPEG: a data URL with its base64",
         }
-    named = metadata.get("features", {}).get("state", [])
+    named = _named(metadata, "state")
     return _array(list(value.shape), named if value.shape[-1:] == (len(named),) else [])
 
 
-def _array(shape: list[int | None], features: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Nested lists of numbers of this shape (None: any); `features` are what the last axis holds."""
+def _named(metadata: Mapping[str, Any], feature: str) -> list[str]:
+    """The names of a policy's "state" or "actions", with units; empty where its metadata, of any make, don't tell."""
+    names = names_of(metadata, feature) or []
+    return [f"{name} {metadata['features'][feature][i].get('unit', '')}".strip() for i, name in enumerate(names)]
+
+
+def _size(value: Any) -> int | None:
+    return value if isinstance(value, int) else None
+
+
+def _array(shape: list[int | None], named: list[str]) -> dict[str, Any]:
+    """Nested lists of numbers of this shape (None: any); `named` are what the last axis holds."""
     if not shape:
         return dict(_NUMBER)
     size, *rest = shape
-    made: dict[str, Any] = {"type": "array", "items": _array(rest, features)}
+    made: dict[str, Any] = {"type": "array", "items": _array(rest, named)}
     if size is not None:
         made |= {"minItems": size, "maxItems": size}
-    if not rest and features:
-        made["description"] = ", ".join(f"{one['name']} {one['unit']}".strip() for one in features)
+    if not rest and named:
+        made["description"] = ", ".join(named)
     return made
 
 
 def _answer(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    named = metadata.get("features", {}).get("actions", [])
-    actions = _array([metadata.get("action_horizon"), metadata.get("robot_action_dim")], named)
+    shape = [_size(metadata.get(name)) for name in ("action_horizon", "robot_action_dim")]
+    actions = _array(shape, _named(metadata, "actions"))
     note = {
         "type": "object",
         "properties": {
