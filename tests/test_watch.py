@@ -441,9 +441,12 @@ def test_a_file_of_something_else_is_refused(fixed: Fixed, tmp_path: Path) -> No
         np.savez(file, **content)  # type: ignore[arg-type]  # names are keywords
         with pytest.raises(ConfigError, match=f"{said}; {expected}"):
             policy_of(fixed, known_cameras=file)
-    file.write_bytes(b"PK nothing")
-    with pytest.raises(ConfigError, match=expected):
-        policy_of(fixed, known_cameras=file)
+    np.savez(file, top=np.zeros((1, 432), np.uint8))
+    whole = file.read_bytes()
+    for damaged in (b"PK nothing", whole[:-40], whole[:60]):
+        file.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=expected):
+            policy_of(fixed, known_cameras=file)
 
 
 def test_masked_cameras_and_float_images_are_judged_as_they_are() -> None:

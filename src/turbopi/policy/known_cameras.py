@@ -6,13 +6,15 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from turbopi.policy.watch import GRID, Sample
 from turbopi.realtime.messages import Note
 from turbopi.support.errors import ConfigError
-from turbopi.support.reading.files import one_line
+from turbopi.support.files import write_whole
+from turbopi.support.reading import read_npz
 
 MOST_IMAGES = 16  # of a camera
 CLEARLY = 1.5  # times nearer to another camera's images, or with red and blue exchanged, than as they are
@@ -51,10 +53,9 @@ class KnownCameras:
     def load(cls, file: str | Path) -> "KnownCameras":
         """What `save` wrote. Raises ConfigError for anything else."""
         try:
-            with np.load(file, allow_pickle=False) as stored:
-                images = {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise ConfigError(f"known_cameras: {file} can't be read ({one_line(error)}); {_EXPECTED}") from error
+            images = read_npz(file, ConfigError)
+        except ConfigError as error:
+            raise ConfigError(f"known_cameras: {file} can't be read ({error}); {_EXPECTED}") from error
         if not images:
             raise ConfigError(f"known_cameras: {file} has no camera; {_EXPECTED}")
         for name, of_one in images.items():
@@ -66,8 +67,8 @@ class KnownCameras:
         return cls(images, str(file))
 
     def save(self, file: Path) -> None:
-        with file.open("wb") as stream:  # by a name, numpy would append .npz
-            np.savez_compressed(stream, **self.images)  # type: ignore[arg-type]  # names are the cameras'
+        images: dict[str, Any] = dict(self.images)
+        write_whole(file, lambda stream: np.savez_compressed(stream, **images))
 
     def notes(self, images: Mapping[str, Sample]) -> tuple[Note, ...]:
         """What the images of one call look like, compared with the known ones; of cameras that both have."""
@@ -78,7 +79,7 @@ class KnownCameras:
         pixels = np.frombuffer(b"".join([images[name].pixels for name in there]), np.uint8)
         every = pixels.reshape(len(there), _SIZE)
         now, turned = _fewer(every), _fewer(every.reshape(len(there), -1, 3)[:, ::-1].reshape(every.shape))
-        away, away_turned = (self._images.distances(images)[:, rows].tolist() for images in (now, turned))
+        away, away_turned = (self._images.distances(both)[:, rows].tolist() for both in (now, turned))
         found, shows = [], {i: i for i in range(len(there))}  # of each camera, which one it shows
         for i, j in itertools.combinations(range(len(there)), 2):
             if away[i][i] + away[j][j] > CLEARLY * (away[i][j] + away[j][i]):
