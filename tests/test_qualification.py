@@ -39,7 +39,7 @@ Child = Callable[[str], None]
 
 @pytest.fixture
 def started(tmp_path: Path) -> Path:
-    """A file with a line for each process that was started: what it was told to exclude."""
+    """A file with a line for each process that was started: what it was to exclude."""
     return tmp_path / "started"
 
 

@@ -32,8 +32,8 @@ int main(int count, char** words) try {
       continue;
     }
     const turbopi::Chunk chunk = turbopi::actions(last);
-    const auto told = last.find("real_time");
-    const bool joined = told != last.end() && told->second.get<turbopi::Map>().at("joined").get<bool>();
+    const auto found = last.find("real_time");
+    const bool joined = found != last.end() && found->second.get<turbopi::Map>().at("joined").get<bool>();
     std::printf("%zu actions of %zu numbers, the first %.3f%s\n", chunk.rows, chunk.columns, chunk.at(0, 0),
                 joined ? ", joined" : "");
   }

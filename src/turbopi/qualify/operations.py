@@ -1,6 +1,6 @@
 """Each operation of a backend beside its reference in plain PyTorch, on the very inputs that a call gives it.
 
-An operation that isn't right is told by its name, and PyTorch's result goes on in its place, so that what comes behind
+An operation that isn't right is named, and PyTorch's result goes on in its place, so that what comes behind
 it is judged by itself.
 """
 

@@ -7,8 +7,8 @@
 
 The kernel lets only processes of the server's user open the descriptor. What the client can't open, because it is on
 another host, in another container or another user's, it does without: messages go through the socket, as they do for
-what is larger than a slot. The file has no name, so whoever dies leaves nothing behind. Its size is sealed: a client
-that cut it would end the server by a signal.
+what is larger than a slot. The file has no name, so a process that dies leaves nothing behind. Its size is sealed: a
+client that cut it would end the server by a signal.
 
 A slot is used again two messages later, when the server has answered the message in it.
 """

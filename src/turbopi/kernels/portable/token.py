@@ -2,7 +2,7 @@
 
 What a GPU does here is read the weights, each once. So a product's programs ask for theirs before they wait for the row
 that they multiply, and norms, GeGLU and residuals are computed beside. Rows and sums are float32, whatever the weights
-and the cache are. Twin of all together: `Pi0FastModel.step`, as engine/token.py launches them.
+and the cache are. The reference of all together, as engine/token.py launches them: `Pi0FastModel.step`.
 
 Shapes: D width, H query heads, K head_dim, S places of keys and values, C shares of them.
 """
