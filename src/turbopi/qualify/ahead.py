@@ -116,8 +116,10 @@ class Ahead:
         self._answers.put(None)
 
 
-def work(subject: Subject, certified: Callable[[], Figures], say: Callable[[Answer], None], asked: IO[bytes]) -> None:
-    """What the second process does, until nothing asks any more."""
+def work(
+    subject: Subject, certified: Callable[[], Figures], say: Callable[[Answer], None], requests: IO[bytes]
+) -> None:
+    """What the second process does, until nobody wants more."""
     try:
         say(Answer(certified=certified()))
     except Exception:  # the first one finds out, and says it
@@ -128,5 +130,5 @@ def work(subject: Subject, certified: Callable[[], Figures], say: Callable[[Answ
     turn = rival_turn(subject)
     turn()
     say(Answer(rival=True))
-    for _ in asked:
+    for _ in requests:
         say(Answer(turn=turn()))
