@@ -43,6 +43,7 @@ class ServerOptions:
     execution_horizon
                     s, actions of a chunk that robots carry out before the next takes over. None: half of a chunk
     delay_steps     control steps from an observation to its chunk at the robot. None: measured here, network apart
+    traces          spans of each call to OpenTelemetry (traces.py)
     """
 
     host: str = "127.0.0.1"
@@ -62,6 +63,7 @@ class ServerOptions:
     control_hz: float | None = None
     execution_horizon: int | None = None
     delay_steps: int | None = None
+    traces: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
