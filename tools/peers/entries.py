@@ -47,8 +47,8 @@ def _pip(*words: str) -> tuple[str, ...]:
 
 
 _CUTLASS = "https://github.com/NVIDIA/cutlass"
-_CMAKE = ("-DGPU_ARCH={arch}", "-DFA2_HDIMS=96;256", "-DFA2_DTYPES=bf16", "-DPython3_EXECUTABLE={python}")
-_HOPPER_AS_ADA = 's/GPU_ARCH STREQUAL "89"  OR/GPU_ARCH STREQUAL "89" OR GPU_ARCH STREQUAL "90" OR/'
+_CMAKE = ("-DGPU_ARCH={arch}", "-DFA2_ARCH_NATIVE_ONLY=ON", "-DFA2_HDIMS=96;256", "-DFA2_DTYPES=bf16")
+_ALSO_90 = 's/GPU_ARCH STREQUAL "89"/GPU_ARCH STREQUAL "89" OR GPU_ARCH STREQUAL "90"/'
 # openpi changes files of transformers, as its README says.
 _OVER_TRANSFORMERS = (
     "import shutil, sys, transformers; shutil.copytree(sys.argv[1], transformers.__path__[0], dirs_exist_ok=True)"
@@ -64,11 +64,11 @@ PROGRAMS = (
         git=("https://github.com/flashrt-project/FlashRT", "e33faa5838f2dceb2cb29d84db36cefb5d4c58ee"),
         install=(
             ("git", "clone", "-q", "--depth=1", "--branch=v4.4.2", _CUTLASS, "{src}/third_party/cutlass"),
-            _pip(_TORCH, "pybind11", "numpy", "ml_dtypes", "safetensors", "cmake>=3.24", "ninja"),
+            _pip(_TORCH, "pybind11", "numpy", "pyyaml", "ml_dtypes", "safetensors", "cmake>=3.24"),
             # It names no Hopper: attention is built there as for the RTX 4090.
-            ("sed", "-i", _HOPPER_AS_ADA, "{src}/CMakeLists.txt"),
+            ("sed", "-i", f"108{_ALSO_90};1130{_ALSO_90}", "{src}/CMakeLists.txt"),
             _pip("--no-deps", "-e", "{src}"),
-            ("{python}", "-m", "cmake", "-S", "{src}", "-B", "{src}/build", *_CMAKE),
+            ("{python}", "-m", "cmake", "-S", "{src}", "-B", "{src}/build", "-DPython3_EXECUTABLE={python}", *_CMAKE),
             ("{python}", "-m", "cmake", "--build", "{src}/build", f"-j{os.cpu_count() or 1}"),
         ),
     ),
