@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 from doc_tables import peers as table
 from peers import __main__ as tool
@@ -21,7 +22,7 @@ JOB = Job(2, 48, 10, 10)
 LIMITS = running.Limits(start_s=30.0, round_s=30.0)
 
 FAKE = """
-import json, os, sys, time
+import json, os, subprocess, sys, time
 job = json.loads(sys.argv[1])
 fault = job.get("fault", "")
 def say(line): print(line if isinstance(line, str) else json.dumps(line), flush=True)
@@ -35,10 +36,13 @@ for number, line in enumerate(sys.stdin):
     if fault == "dies" and number: os._exit(3)
     if fault == "hangs" and number: time.sleep(60)
     if fault == "garbage": say("<html>"); continue
+    with open(os.environ["TURNS"], "a") as turns: turns.write(job["program"] + " ")
     part = {"ms": [2.0 + number] * calls, "shape": [job["horizon"], 32], "finite": True}
     part |= job.get("answer", {})
+    if fault == "leaves a server": server = subprocess.Popen(["sleep", "60"], start_new_session=True)
+    if fault == "leaves a server": open(job["pid"], "w").write(str(server.pid))
     say({"whole call": part, **({"on the GPU": part} if not (fault == "forgets" and number) else {})})
-    with open(os.environ["TURNS"], "a") as turns: turns.write(job["program"] + " ")
+    if fault == "quits": os._exit(5)
 """
 
 
@@ -74,8 +78,9 @@ def test_programs_are_called_in_turns_and_none_is_always_first(fake: entries.Pro
     [
         ({"fault": "no start"}, "start", "it ended with 1 before it got ready; its last words: no such GPU"),
         ({"fault": "chats"}, "start", "it said 'loading weights ...', which wasn't expected"),
-        ({"fault": "speaks twice"}, "call", "without being told to"),
+        ({"fault": "speaks twice"}, "call", 'it said \'{"ready"'),
         ({"fault": "dies"}, "call", "round 2: it ended with 3 before it answered 2 calls"),
+        ({"fault": "quits"}, "call", "round 2: it ended with 5 before it answered 2 calls"),
         ({"fault": "garbage"}, "call", "it said '<html>', which wasn't expected"),
         ({"fault": "forgets"}, "call", "round 2: it timed ['whole call'], and before ['on the GPU', 'whole call']"),
         ({"answer": {"shape": [50, 32]}}, "call", "its actions are [50, 32]; expected [10, d]"),
@@ -107,6 +112,13 @@ def test_a_program_that_hangs_is_ended(fake: entries.Program, fault: str, limits
     settings = [(fake, "bf16", sys.executable, {"fault": fault})]
     found, (lost,) = running.time_job(settings, JOB, rounds=3, calls=2, limits=limits)
     assert not found and said in lost.reason
+
+
+def test_what_a_program_started_ends_with_it(fake: entries.Program, tmp_path: Path) -> None:
+    found, lost = timed(fake, {"fault": "leaves a server", "pid": str(tmp_path / "pid")})
+    assert not lost and found
+    pid = int((tmp_path / "pid").read_text())
+    assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
 
 
 def test_a_python_that_is_missing_is_a_reason(fake: entries.Program) -> None:
@@ -148,6 +160,9 @@ def test_each_programs_plan_is_whole(program: entries.Program, tmp_path: Path) -
         if "pip" in command and "-e" not in command:
             assert any("==" in word for word in command), command
     assert bool(plan) == (program is not entries.OURS)
+    offline = installing.commands(program, tmp_path, "90", src="/sources", site_packages=True)
+    assert all(program.git[0] not in command for command in offline) if program.git else True
+    assert (["cp", "-r", "/sources", str(tmp_path / program.name / "src")] in offline) == bool(plan)
 
 
 def test_every_setting_has_a_row_in_the_table() -> None:

@@ -43,14 +43,13 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     verbs.add_parser("list", help="what there is, and what is installed")
     installing = verbs.add_parser("install", help="install programs anew")
     installing.add_argument("names", nargs="+", metavar="NAME", help=f"{', '.join(OTHERS)}; or all")
-    installing.add_argument("--site-packages", action="store_true", help="environments see this machine's packages")
+    installing.add_argument("--site-packages", action="store_true", help="environments see this Python's packages")
     running = verbs.add_parser("run", help="time programs beside Turbo-Pi")
     running.add_argument("--peers", default="all", help=f"some of {','.join(OTHERS)}; all")
     running.add_argument("--out", type=Path, metavar="FILE")
     running.add_argument(
         "--python", action="append", default=[], metavar="NAME=PATH", help="an environment that exists"
     )
-    running.add_argument("--src", action="append", default=[], metavar="NAME=FOLDER", help="sources that exist")
     running.add_argument("--checkpoint", type=Path, metavar="FOLDER", help="for the servers: LeRobot's pi05_base")
     running.add_argument("--cameras", type=int, default=2)
     running.add_argument("--prompt-tokens", type=int, default=48)
@@ -63,6 +62,7 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     running.add_argument("--device", choices=("cuda", "cpu"), default="cuda" if torch.cuda.is_available() else "cpu")
     running.add_argument("--small", action="store_true", help="small models, to try the tool; no figure")
     for verb in (installing, running):
+        verb.add_argument("--src", action="append", default=[], metavar="NAME=FOLDER", help="sources that exist")
         verb.add_argument("--dry-run", action="store_true", help="only print what would be run")
     given = parser.parse_args(arguments)
     console = console or Console(soft_wrap=True)
@@ -102,13 +102,14 @@ def arch() -> str:
 
 
 def install_all(programs: list[Program], given: argparse.Namespace, console: Console) -> int:
-    failed = False
+    failed, sources = False, _named(given.src)
     for program in programs:
+        src = sources.get(program.name)
         if given.dry_run:
-            for command in commands(program, given.home, arch(), site_packages=given.site_packages):
+            for command in commands(program, given.home, arch(), src=src, site_packages=given.site_packages):
                 console.print(escape(f"{program.name}: {' '.join(command)}"))
             continue
-        reason = install(program, given.home, arch(), site_packages=given.site_packages)
+        reason = install(program, given.home, arch(), src=src, site_packages=given.site_packages)
         failed = failed or reason is not None
         console.print(escape(f"{program.name}: {reason or 'installed'}"))
     return int(failed)

@@ -46,7 +46,7 @@ def _pip(*words: str) -> tuple[str, ...]:
     return ("{python}", "-m", "pip", "install", "--quiet", *words)
 
 
-_CUTLASS = "https://github.com/NVIDIA/cutlass"
+_CUTLASS = "--branch=v4.4.2 https://github.com/NVIDIA/cutlass {src}/third_party/cutlass"
 _CMAKE = ("-DGPU_ARCH={arch}", "-DFA2_ARCH_NATIVE_ONLY=ON", "-DFA2_HDIMS=96;256", "-DFA2_DTYPES=bf16")
 _ALSO_90 = 's/GPU_ARCH STREQUAL "89"/GPU_ARCH STREQUAL "89" OR GPU_ARCH STREQUAL "90"/'
 # openpi changes files of transformers, as its README says.
@@ -63,7 +63,7 @@ PROGRAMS = (
         ("bf16", "fp8 nt_autotune=force", "fp8 nt_autotune=off"),
         git=("https://github.com/flashrt-project/FlashRT", "e33faa5838f2dceb2cb29d84db36cefb5d4c58ee"),
         install=(
-            ("git", "clone", "-q", "--depth=1", "--branch=v4.4.2", _CUTLASS, "{src}/third_party/cutlass"),
+            ("sh", "-c", f"test -d {{src}}/third_party/cutlass || git clone -q --depth=1 {_CUTLASS}"),
             _pip(_TORCH, "pybind11", "numpy", "pyyaml", "ml_dtypes", "safetensors", "cmake>=3.24"),
             # It names no Hopper: attention is built there as for the RTX 4090.
             ("sed", "-i", f"108{_ALSO_90};1130{_ALSO_90}", "{src}/CMakeLists.txt"),
@@ -77,7 +77,7 @@ PROGRAMS = (
         "run_realtime_vla.py",
         ("triton",),
         git=("https://github.com/dexmal/realtime-vla-v2", "a36d02a7b241de1129af2048e749de58f95ead9c"),
-        install=(_pip(_TORCH, "numpy", "transformers==4.53.2"),),
+        install=(_pip(_TORCH, "numpy", "transformers>=4.53"),),
     ),
     Program(
         "openpi-pytorch",
@@ -85,7 +85,7 @@ PROGRAMS = (
         ("bf16 reduce-overhead", "bf16 eager"),
         git=("https://github.com/Physical-Intelligence/openpi", "15a9616a00943ada6c20a0f158e3adb39df2ccac"),
         install=(
-            _pip(_TORCH, "transformers==4.53.2", "numpy", "pytest", "beartype"),
+            _pip(_TORCH, "transformers==4.53.2", "numpy"),
             ("{python}", "-c", _OVER_TRANSFORMERS, "{src}/src/openpi/models_pytorch/transformers_replace"),
         ),
     ),

@@ -1,10 +1,11 @@
 """Each program in an environment of its own: HOME/NAME/venv and HOME/NAME/src.
 
-pip's and git's own settings hold: PIP_NO_INDEX and PIP_FIND_LINKS for wheels from a folder, git's `insteadOf` for a
-mirror, where the GPU machine has no network.
+On a machine without a network: PIP_NO_INDEX and PIP_FIND_LINKS take wheels from a folder, sources come from a folder,
+and environments may see the packages of the Python that runs the tool.
 """
 
 import shutil
+import site
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from turbopi.support.files import write_whole
 
 INSTALL_S = 3600.0  # of one command
 _DONE, _WHY = "installed.txt", "failed.txt"
+# A venv's own --system-site-packages doesn't see the packages of a Python that is a venv itself.
+_SEES = "import site, sys; open(site.getsitepackages()[0] + '/seen.pth', 'w').write(sys.argv[1])"
 
 
 def folder_of(program: Program, home: Path) -> Path:
@@ -26,16 +29,19 @@ def python_of(program: Program, home: Path) -> str:
     return str(folder_of(program, home) / "venv" / "bin" / "python") if program.install else sys.executable
 
 
-def commands(program: Program, home: Path, arch: str, *, site_packages: bool = False) -> list[list[str]]:
-    """All that `install` runs, in order."""
+def commands(
+    program: Program, home: Path, arch: str, *, src: str | None = None, site_packages: bool = False
+) -> list[list[str]]:
+    """All that `install` runs, in order. src: sources that are there, which are copied instead of fetched."""
     if not program.install:
         return []
     folder = folder_of(program, home)
     values = {"python": python_of(program, home), "src": str(folder / "src"), "arch": arch}
-    venv = [program.python or sys.executable, "-m", "venv", *["--system-site-packages"] * site_packages]
+    seen = [values["python"], "-c", _SEES, "\n".join(site.getsitepackages())]
     return [
-        [*venv, str(folder / "venv")],
-        *program.fetching(folder / "src"),
+        [program.python or sys.executable, "-m", "venv", str(folder / "venv")],
+        *([seen] if site_packages else []),
+        *([["cp", "-r", src, values["src"]]] if src else program.fetching(folder / "src")),
         *([_filled(word, values) for word in command] for command in program.install),
     ]
 
@@ -57,12 +63,14 @@ def missing(program: Program, home: Path) -> str | None:
         return f"it isn't installed in {folder.name}: python -m peers install {program.name}"
 
 
-def install(program: Program, home: Path, arch: str, *, site_packages: bool = False) -> str | None:
+def install(
+    program: Program, home: Path, arch: str, *, src: str | None = None, site_packages: bool = False
+) -> str | None:
     """Install it anew. Returns why it failed, or None; either is written down for `run`."""
     folder = folder_of(program, home)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    for command in commands(program, home, arch, site_packages=site_packages):
+    for command in commands(program, home, arch, src=src, site_packages=site_packages):
         if reason := _run(command):
             write_whole(folder / _WHY, reason.encode())
             return reason

@@ -22,6 +22,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 
 from peers.document import PARTS, NotMeasured, Part, Stage, Timed
 from peers.entries import TOOLS, Program
@@ -72,7 +73,8 @@ class Running:
             self._folder.cleanup()
             raise Failed(f"{python}: {error.strerror}") from None
         self._lines: queue.Queue[bytes] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
         self.ready = self._said(start_s, Ready, "got ready")
 
     def _listen(self) -> None:
@@ -84,8 +86,10 @@ class Running:
 
     def time(self, calls: int, seconds: float) -> dict[str, Round]:
         """Its parts, with the milliseconds of each call."""
-        if not self._lines.empty() and (line := self._lines.get()):
-            raise self._failed(f"it said {_start(line)} without being told to")
+        if not self._lines.empty():
+            if line := self._lines.get():
+                raise self._failed(f"it said {_start(line)} without being told to")
+            self._lines.put(line)  # it has ended
         assert self._process.stdin is not None
         with suppress(OSError):  # it is gone: its end is read below
             self._process.stdin.write(json.dumps({"calls": calls}).encode() + b"\n")
@@ -116,15 +120,22 @@ class Running:
         if self._ended:
             return
         self._ended = True
+        started = []  # a server's workers may be in groups of their own
+        with suppress(psutil.Error):
+            started = psutil.Process(self._process.pid).children(recursive=True)
         with suppress(OSError):
             os.killpg(self._process.pid, signal.SIGKILL)
+        for process in started:
+            with suppress(psutil.Error):
+                process.kill()
         self._process.wait()
+        self._listener.join(1.0)
         with suppress(OSError):
             self._text = self._log.read_text(errors="replace")
-        for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):
-                assert pipe is not None
-                pipe.close()
+        for pipe in (self._process.stdin, None if self._listener.is_alive() else self._process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
         self._folder.cleanup()
 
 
