@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.requests import TIMING, ClientRequest, Refusal
-from turbopi.support.errors import ConfigError
 from turbopi.version import turbopi_version
 
 CLOSE_SECONDS = 2.0  # for the last spans, when the server stops
@@ -59,24 +58,20 @@ def parts_of(request: ClientRequest, timing: Mapping[str, float], finished: floa
 class Traces:
     """Hands spans to OpenTelemetry's own thread, which exports them. For the event loop's thread.
 
-    Nothing that fails here reaches a call: it is logged. Raises ConfigError without the packages.
+    Nothing that fails here reaches a call: it is logged.
     """
 
     def __init__(self, log: LimitedLog) -> None:
-        try:
-            from opentelemetry import trace
-            from opentelemetry.sdk.resources import Resource
-            from opentelemetry.sdk.trace import TracerProvider
-            from opentelemetry.sdk.trace.export import BatchSpanProcessor
-            from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+        from opentelemetry import trace
+        from opentelemetry.sdk.resources import Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+        from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
-            exporter = make_exporter()
-        except ImportError as error:
-            raise ConfigError(f"--traces needs OpenTelemetry: pip install 'turbopi[otel]' ({error})") from error
         self._trace, self._propagator, self._log = trace, TraceContextTextMapPropagator(), log
         name = os.environ.get("OTEL_SERVICE_NAME", "turbopi")
         self._provider = TracerProvider(resource=Resource.create({"service.name": name}), shutdown_on_exit=False)
-        self._provider.add_span_processor(BatchSpanProcessor(exporter))
+        self._provider.add_span_processor(BatchSpanProcessor(make_exporter()))
         self._tracer = self._provider.get_tracer("turbopi", turbopi_version())
         self._offset = time.time_ns() - time.perf_counter_ns()
 
