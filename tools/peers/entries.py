@@ -49,9 +49,10 @@ def _pip(*words: str) -> tuple[str, ...]:
 _CUTLASS = "--branch=v4.4.2 https://github.com/NVIDIA/cutlass {src}/third_party/cutlass"
 _CMAKE = ("-DGPU_ARCH={arch}", "-DFA2_ARCH_NATIVE_ONLY=ON", "-DFA2_HDIMS=96;256", "-DFA2_DTYPES=bf16")
 _ALSO_90 = 's/GPU_ARCH STREQUAL "89"/GPU_ARCH STREQUAL "89" OR GPU_ARCH STREQUAL "90"/'
-# openpi changes files of transformers, as its README says.
+# openpi changes files of transformers, as its README says; none but this environment's own.
 _OVER_TRANSFORMERS = (
-    "import shutil, sys, transformers; shutil.copytree(sys.argv[1], transformers.__path__[0], dirs_exist_ok=True)"
+    "import shutil, sys, transformers; there = transformers.__path__[0]; assert there.startswith(sys.prefix), there; "
+    "shutil.copytree(sys.argv[1], there, dirs_exist_ok=True)"
 )
 
 OURS = Program("turbopi", "run_turbopi.py", ("bf16", "fp8"))
