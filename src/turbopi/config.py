@@ -43,6 +43,7 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
     "temporal_every": 256,
     "state_dim": 1024,
 }
+MOST_GUIDANCE = 100.0  # scale of guidance by a prompt's tag; 1.5 to 2.5 are in use
 MOST_REMEMBERED = 2048  # observations of an episode that a policy with memory keeps: 1.2 GB for each camera
 
 

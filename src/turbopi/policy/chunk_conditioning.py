@@ -14,6 +14,7 @@ from turbopi.models.pi0.conditioning import (
     Conditionings,
     Form,
     Guidance,
+    PromptGuidance,
     TokenTimes,
     guidance_strength,
     row_named,
@@ -36,11 +37,16 @@ class Joins:
     steps: int
     horizon: int
     integration: Integration | None = None
+    guidance: float = 0.0  # as `Incoming`'s
+
+    @property
+    def two_prompts(self) -> bool:
+        return self.guidance not in (0, 1)
 
     @property
     def forms(self) -> list[Form]:
         """What each observation's denoising loop must be able to do, as far as a batch is concerned."""
-        return [self._form(*row) for row in self.rows]
+        return ["two_prompts"] * len(self.rows) if self.two_prompts else [self._form(*row) for row in self.rows]
 
     def _form(self, conditioning: Conditioning | None, chunk: RunningChunk | None) -> Form:
         if chunk is None:
@@ -62,18 +68,23 @@ class ChunkConditioning:
         pipeline: Pipeline,
         backend: Backend | type[Backend],
         integration: Integration | None = None,
+        two_prompts: bool = False,
     ) -> None:
         self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
-        self._integration = integration
-        if integration is not None and (why := backend.refuses_form("solver")) is not None:
-            raise ConfigError(why)
+        self._integration, self._two_prompts = integration, two_prompts
+        needed: dict[Form, bool] = {"solver": integration is not None, "two_prompts": two_prompts}
+        for form, wanted in needed.items():
+            if wanted and (why := backend.refuses_form(form)) is not None:
+                raise ConfigError(why)
 
     @property
     def modes(self) -> tuple[JoinMode, ...]:
         """What `RunningChunk`s may ask of this policy."""
         if self._integration is not None and not self._integration.is_euler:
             return ()  # see `Conditioning`
-        able, trained = self._backend.forms, self._config.real_time.trained_max_delay > 0
+        able, trained = set(self._backend.forms), self._config.real_time.trained_max_delay > 0
+        if self._two_prompts and "two_prompts_jacobian" not in able:
+            able.discard("jacobian")
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
     def checked(
@@ -83,17 +94,23 @@ class ChunkConditioning:
         steps: int,
         horizon: int,
         integration: Integration | None = None,
+        guidance: float | None = None,
     ) -> Joins:
         """What each observation of a call is to join, and how it is integrated.
 
         Raises ObservationError; of several observations it names the row.
         """
+        joins = Joins([], steps, horizon, integration, guidance or 0.0)
+        if joins.two_prompts:
+            self._check_form("two_prompts")
         rows = [self._checked(None, None, steps, horizon, integration)] * len(conditionings)
         for i, (conditioning, chunk) in enumerate(zip(conditionings, previous, strict=True)):
             if conditioning is not None or chunk is not None:
                 with row_named(i, len(conditionings)):
                     rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
-        return Joins(rows, steps, horizon, integration)
+                    jacobian = joins.two_prompts and joins._form(*rows[i]) == "jacobian"
+                    self._check_form("two_prompts_jacobian" if jacobian else "plain")
+        return replace(joins, rows=rows)
 
     def _checked(
         self,
@@ -124,16 +141,22 @@ class ChunkConditioning:
             self._check_form(FORMS[previous.mode])
         return conditioning, previous
 
-    def conditioning(self, joins: Joins, states: Sequence[np.ndarray]) -> Conditionings:
+    def conditioning(
+        self, joins: Joins, states: Sequence[np.ndarray], tagged: Sequence[np.ndarray | None]
+    ) -> Conditionings:
         """What the backend is given beside the noise, once the new states are known. Raises ObservationError.
+
+        tagged  of each the second prompt, as `Incoming`'s
 
         None for an ordinary call, else one for all observations, or a list with one for each.
         """
         rows: list[Conditioning | None] = []
-        for i, ((one, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+        for i, ((one, chunk), state, tokens) in enumerate(zip(joins.rows, states, tagged, strict=True)):
             if chunk is not None:
                 with row_named(i, len(states)):
                     one = self._of_chunk(chunk, state, joins)
+            if tokens is not None:
+                one = replace(one or Conditioning(), prompt=PromptGuidance(tokens, joins.guidance))
             rows.append(None if one is None or one.form == "plain" else one)
         return rows[0] if all(one is rows[0] for one in rows) else rows
 
@@ -182,7 +205,10 @@ class ChunkConditioning:
             except ObservationError as error:
                 raise ConfigError(f"warm-up: {error}") from None
             requested.append((steps, horizon, one))
-        return requested
+        if not self._two_prompts:
+            return requested
+        example = PromptGuidance(np.zeros(1, np.int64), 2.0)
+        return [(*loop, replace(one or Conditioning(), prompt=example)) for *loop, one in requested]  # type: ignore[misc]
 
     def _check_form(self, form: Form) -> None:
         if (why := self._backend.refuses_form(form)) is not None:
