@@ -60,6 +60,7 @@ class Denoising:
     """How noise becomes actions: evaluations of the action expert, solver, time grid. A policy's own, or a call's.
 
     guidance  scale of guidance by the policy's tag (`PromptGuidance`); None: the policy has no tag
+    one_step  weights are distilled for one evaluation, and take no other number
     refused   why a model has nothing of the kind: then `steps` are tokens of an answer at most
     """
 
@@ -67,6 +68,7 @@ class Denoising:
     solver: Solver = "euler"
     time_grid: GridName | tuple[float, ...] = "uniform"
     guidance: float | None = None
+    one_step: bool = False
     refused: str | None = None
 
     @classmethod
@@ -105,7 +107,7 @@ class Denoising:
             model: Any = config.model
             return cls(model.max_decoding_steps, refused=why).changed(steps, solver, time_grid, ConfigError)
         number = checked_steps(config.num_denoising_steps, ConfigError)
-        own = cls(number).changed(None, config.solver, config.solver_grid, ConfigError)
+        own = cls(number, one_step=config.one_step).changed(None, config.solver, config.solver_grid, ConfigError)
         if own.steps != number and intervals(own.solver, number) == intervals(own.solver, own.steps):
             own = replace(own, steps=number)  # fits the grid's times, too
         return own.changed(steps, solver, time_grid, ConfigError)
@@ -148,7 +150,9 @@ class Denoising:
                     f"{count} steps of solver {chosen!r} are {intervals(chosen, count)} intervals, but the time grid "
                     f"has {len(grid) - 1}: give {fits} steps, leave them out, or take time grid 'uniform'"
                 )
-        return Denoising(count, chosen, grid, self.guidance)
+        if self.one_step and count != 1:
+            raise error(f"{count} denoising steps were asked for, but these weights were distilled for one alone")
+        return replace(self, steps=count, solver=chosen, time_grid=grid)
 
     def of_call(
         self,
