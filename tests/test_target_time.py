@@ -39,8 +39,8 @@ def one_step(plain: Checkpoint, s: float, layers: dict[str, torch.Tensor]) -> to
     case, (first, first_bias, last, last_bias) = case_of(plain), layers.values()
     model = model_of(plain)
     pi05, width = model.config.kind == "pi05", model.config.expert.width
-    told = time_embedding(np.array([s]), width)
-    added = F.linear(F.silu(F.linear(told, first, first_bias)), last, last_bias)
+    sincos = time_embedding(np.array([s]), width)
+    added = F.linear(F.silu(F.linear(sincos, first, first_bias)), last, last_bias)
     time = time_embedding(np.ones(1), width) + added
     cache, tokens = model.prefix(case.observation), case.noise.shape[1] + (not pi05)
     rope = suffix_rope(cache, tokens, model.config.expert.head_dim, model.config.rope_base)

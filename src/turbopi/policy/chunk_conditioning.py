@@ -21,7 +21,7 @@ from turbopi.models.pi0.conditioning import (
 )
 from turbopi.models.pi0.solvers import Integration
 from turbopi.preprocess.pipeline import Pipeline
-from turbopi.realtime.running_chunk import FORMS, JoinMode, RunningChunk
+from turbopi.realtime.running_chunk import FORMS, WARM_START, JoinMode, RunningChunk
 from turbopi.support.errors import ConfigError, ObservationError
 
 Loop = tuple[int, int]  # denoising steps, action horizon
@@ -53,6 +53,8 @@ class Joins:
             return batch_form(conditioning)
         if chunk.mode == "rtc_trained" and chunk.delay == 0:  # nothing is held
             return batch_form(integrated(None, self.integration))
+        if chunk.mode == "warm_start":
+            return batch_form(Conditioning(integration=warmed(self.integration, self.steps)))
         return FORMS[chunk.mode]
 
 
@@ -80,12 +82,13 @@ class ChunkConditioning:
     @property
     def modes(self) -> tuple[JoinMode, ...]:
         """What `RunningChunk`s may ask of this policy."""
-        if self._integration is not None and not self._integration.is_euler:
-            return ()  # see `Conditioning`
         able, trained = set(self._backend.forms), self._config.real_time.trained_max_delay > 0
         if self._two_prompts and "two_prompts_jacobian" not in able:
             able.discard("jacobian")
-        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
+        if self._integration is not None and not self._integration.is_euler:
+            able &= {"solver"}  # see `Conditioning`
+        lacking = {"rtc_trained": not trained, "warm_start": self._config.one_step}
+        return tuple(mode for mode, form in FORMS.items() if form in able and not lacking.get(mode, False))
 
     def checked(
         self,
@@ -124,10 +127,10 @@ class ChunkConditioning:
             raise ObservationError("conditioning and previous were both given; give one of them")
         if previous is None:
             conditioning = integrated(conditioning, integration)
-        elif integration is not None and not integration.is_euler:
+        elif integration is not None and not integration.is_euler and previous.mode != "warm_start":
             raise ObservationError(
                 f"a running chunk and solver {integration.solver!r} were both given: chunks join by Euler's steps, so "
-                "take solver 'euler', whose time grid may be any, or leave out previous"
+                "take solver 'euler', whose time grid may be any, mode warm_start, or leave out previous"
             )
         if conditioning is not None:
             conditioning.check(steps, horizon, self._model.action_dim)
@@ -139,6 +142,11 @@ class ChunkConditioning:
                 options = replace(options, execution_horizon=horizon - end if end < horizon else None)
             previous = previous.completed(horizon, self._model.action_dim, relative=relative, options=options)
             self._check_form(FORMS[previous.mode])
+            if previous.mode == "warm_start" and self._config.one_step:
+                raise ObservationError(
+                    "these weights were distilled for one step from noise alone, so they have no warm start: take "
+                    "another mode, or leave out previous"
+                )
         return conditioning, previous
 
     def conditioning(
@@ -160,8 +168,19 @@ class ChunkConditioning:
             rows.append(None if one is None or one.form == "plain" else one)
         return rows[0] if all(one is rows[0] for one in rows) else rows
 
+    def started(self, joins: Joins, states: Sequence[np.ndarray], noise: np.ndarray) -> np.ndarray:
+        """float32[B, H, action_dim]: what the backend is given as noise. Rows with a warm start begin elsewhere."""
+        for row, ((_, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+            if chunk is not None and chunk.mode == "warm_start":
+                left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+                noise = noise.copy()
+                noise[row] = chunk.begun(left_over, noise[row])
+        return noise
+
     def _of_chunk(self, chunk: RunningChunk, state: np.ndarray, joins: Joins) -> Conditioning:
         steps, horizon, integration = joins.steps, joins.horizon, joins.integration
+        if chunk.mode == "warm_start":
+            return Conditioning(integration=warmed(integration, steps))
         left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
         conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
         if integration is not None:
@@ -194,7 +213,11 @@ class ChunkConditioning:
                     f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
                 )
             for loop in loops:
-                requested.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
+                own = integrations(loop[0])
+                if mode == "warm_start":
+                    requested.append((*loop, Conditioning(integration=warmed(own, loop[0]))))
+                else:
+                    requested.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), own)))
         for one in others:
             steps, horizon = one.size(num_steps, self._model.action_horizon)
             try:
@@ -213,6 +236,14 @@ class ChunkConditioning:
     def _check_form(self, form: Form) -> None:
         if (why := self._backend.refuses_form(form)) is not None:
             raise ObservationError(why)
+
+
+def warmed(integration: Integration | None, steps: int) -> Integration:
+    """As an integration, or so many equal Euler steps, from where a warm start begins."""
+    if integration is None:
+        return Integration("euler", tuple(WARM_START * (1 - i / steps) for i in range(steps + 1)))
+    times = tuple(WARM_START * t for t in integration.times)
+    return Integration(integration.solver, times, integration.evaluations)
 
 
 def integrated(conditioning: Conditioning | None, integration: Integration | None) -> Conditioning | None:

@@ -69,8 +69,8 @@ class ModelCall:
         episodes = [self.see(obs, joins.guidance) for obs in observations]
         each = [frames[-1][0] for frames in episodes]
         states, readings = [seen.state for seen in each], [self._checks.reading(seen) for seen in each]
-        tagged = [seen.tagged for seen in each]
-        x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states, tagged)
+        conditioning = self._conditioning.conditioning(joins, states, [seen.tagged for seen in each])
+        x_1 = torch.from_numpy(self._conditioning.started(joins, states, noise()))
         requested = time.perf_counter()
         with self._turn(observations):
             infer_start = time.perf_counter()
@@ -122,7 +122,8 @@ class ModelCall:
             for seen in each:
                 self._pipeline.read(seen)  # while the device is at the first ones' images
             readings = [self._checks.reading(seen) for seen in each]
-            x_1, states = noise(), [seen.state for seen in each]
+            states = [seen.state for seen in each]
+            x_1 = self._conditioning.started(joins, states, noise())
             conditioning = self._conditioning.conditioning(joins, states, [seen.tagged for seen in each])
             tokens, state = [seen.tokens[seen.token_mask] for seen in each], np.stack([one.model_state for one in each])
             sample = begun.finish(tokens, state, x_1, joins.steps, conditioning)
