@@ -16,6 +16,7 @@ from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
+from turbopi.checkpoint.rlinf import in_known_layout
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
@@ -145,9 +146,9 @@ def _source(location: Location, settings: Settings) -> WeightSource:
     if location.format == "onnx":
         return GraphSource(open_export(location.folder))
     if location.format == "lerobot":
-        source = _lerobot_weights(location.weights, location)
+        source: WeightSource = _lerobot_weights(location.weights, location)
     else:
-        source = TorchSource(location.weights, format=location.format)
+        source = in_known_layout(TorchSource(location.weights, format=location.format), location.weights)
     if (location.weights / ADAPTER).is_file():
         source.notes.append(f"{ADAPTER} isn't followed: there are whole weights, and no use_peft = true in config.json")
     return source
