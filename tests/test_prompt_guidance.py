@@ -307,9 +307,13 @@ class TestPolicy:
         with pytest.raises(ConfigError, match=message):
             made_of(tiny, **options)
 
-    def test_calls_of_a_policy_without_a_tag_and_other_families_refuse(self, plain: UnifiedPolicy) -> None:
+    def test_calls_of_a_policy_without_a_tag_and_other_families_refuse(
+        self, plain: UnifiedPolicy, policy: UnifiedPolicy
+    ) -> None:
         with pytest.raises(ObservationError, match="this policy has no tag: give guidance_tag=TEXT where it is made"):
             plain.infer(plain.example_observation(), guidance=1.5)
+        with pytest.raises(ObservationError, match="guidance was given twice"):
+            policy.infer(policy.example_observation(), conditioning=Conditioning(prompt=PromptGuidance(TAGGED, 2.0)))
         with pytest.raises(ConfigError, match=r"is for Pi0\.5 and Pi0, not for Pi0-FAST"):
             made_of(random_checkpoint("pi0_fast_tiny"), guidance_tag=TAG)
 

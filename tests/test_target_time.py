@@ -146,6 +146,7 @@ def test_another_number_of_steps_is_refused(tmp_path: Path) -> None:
         ({}, {"target_time": 1}, ConfigError, "target_time is 1.0, but .* has no tensors of a target time"),
         ({}, {"target_time": 1.5}, ConfigError, "target_time is 1.5; expected a number from 0 to 1, or 'unused'"),
         ({"target_time_mlp.0.weight": (8, 8)}, {}, CheckpointError, "that forks add in different places"),
+        ({"target_time_mlp/in/kernel": (8, 8)}, {}, CheckpointError, "that forks add in different places"),
         ({"logvar_proj.weight": (1, 8)}, {}, CheckpointError, r"logvar_proj\.weight: a decoupled mean flow \(DMF\)"),
         ({"time_proj.weight": (8, 8)}, {}, CheckpointError, r"a mean flow of two times \(SMF\)"),
         ({"target_time_mlp_1.weight": (8, 8)}, {"target_time": 0}, CheckpointError, "MLP doesn't fit the model"),

@@ -327,9 +327,9 @@ class PolicyConfig:
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
     num_denoising_steps: int = 10  # the default of a call; so are the next two
-    one_step: bool = False  # distilled for one denoising step: no other number makes its actions
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
+    one_step: bool = False  # distilled for one denoising step: no other number makes its actions
     real_time: RealTime = RealTime()
     missing_cameras: MissingCameras = "masked"  # "black": seen as black images, as by openpi's Pi0-FAST
     prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so

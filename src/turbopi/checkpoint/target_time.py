@@ -12,6 +12,7 @@ No file says s, and public forks differ, in the names, too: `_PAIRS`. Others add
 something else from a second time; they are refused.
 """
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -33,9 +34,9 @@ _PAIRS = (  # the two layers of the MLP: tether's, of forks of openpi's JAX, Phy
     ("target_time_mlp_in", "target_time_mlp_out"),
 )
 _REFUSED = {
-    "target_time_mlp.": "a target time that forks add in different places, some behind time_mlp_out",
-    "logvar_proj.": "a decoupled mean flow (DMF), whose second time goes through time_mlp_in, too",
-    "time_proj.": "a mean flow of two times (SMF)",
+    "target_time_mlp": "a target time that forks add in different places, some behind time_mlp_out",
+    "logvar_proj": "a decoupled mean flow (DMF), whose second time goes through time_mlp_in, too",
+    "time_proj": "a mean flow of two times (SMF)",
 }
 _MEETS = ("time_mlp_in", "action_time_mlp_in")  # whose input the time's embedding is, or is the last part of
 
@@ -102,8 +103,8 @@ def with_target_time(source: WeightSource, s: TargetTime | None, where: object, 
 
     Raises CheckpointError for weights of another way to make one step, ConfigError where s isn't known, or is for none.
     """
-    for beginning, what in _REFUSED.items():
-        if found := [source.native_name(name) for name in source.shapes if name.startswith(beginning)]:
+    for module, what in _REFUSED.items():
+        if found := [source.native_name(name) for name in source.shapes if re.match(rf"{module}[./]", name)]:
             raise CheckpointError(f"{where} has {listing(found)}: {what}. Turbo-Pi doesn't compute that")
     layers = next((pair for pair in _PAIRS if any(f"{layer}.weight" in source.shapes for layer in pair)), None)
     if layers is None:

@@ -181,7 +181,7 @@ class BatchLoop:
         by_token = loop if isinstance(loop, ConditionedLoop) else None
         plain = isinstance(loop, EulerLoop) and not buffers.size.two_prompts
         assert plain or isinstance(by, Weights), loop
-        assert buffers.size.two_prompts or not isinstance(loop, SolverLoop), loop
+        assert loop.form != ("jacobian" if buffers.size.two_prompts else "solver"), loop
         self._buffers, self._by = buffers, by
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"

@@ -284,6 +284,7 @@ class BatchRunner(GraphRunner):
             for size in self._split(len(rows), form):
                 calls.append((size, rows[:size]))
                 rows = rows[size:]
+        assert sum(len(rows) for _, rows in calls) == len(forms), forms
         return calls
 
     def _split(self, count: int, form: Form) -> list[int]:

@@ -111,6 +111,8 @@ class ChunkConditioning:
             if conditioning is not None or chunk is not None:
                 with row_named(i, len(conditionings)):
                     rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
+                    if joins.two_prompts and conditioning is not None and conditioning.prompt is not None:
+                        raise ObservationError("guidance was given twice, by the conditioning and by a scale: give one")
                     jacobian = joins.two_prompts and joins._form(*rows[i]) == "jacobian"
                     self._check_form("two_prompts_jacobian" if jacobian else "plain")
         return replace(joins, rows=rows)
