@@ -250,6 +250,13 @@ class TestPolicy:
         assert prompt_texts(f"pick\n{TAG}", state)[0][0] == f"Task: pick {TAG}, State: 128 128;\nAction: "
         assert prompt_texts(f"pick\n{TAG}", None, as_is=True)[0][0] == f"pick\n{TAG}\n"
 
+    @pytest.mark.parametrize("guidance", [1, 1.5])
+    def test_a_tag_that_would_be_cut_is_refused(self, policy: UnifiedPolicy, guidance: float) -> None:
+        long = policy.example_observation() | {"prompt": "pick up the cup " * 100}
+        with pytest.raises(ObservationError, match=r"guidance's tag take \d+ tokens, but the model reads 200"):
+            policy.infer(long, guidance=guidance)
+        assert np.isfinite(policy.infer(long, guidance=0)["actions"]).all(), "cut, as openpi does, with a warning"
+
     def test_a_policys_guidance_is_the_backends(self, policy: UnifiedPolicy) -> None:
         observation = policy.example_observation()
         found = policy.infer(observation, seed=3)["actions"]

@@ -342,20 +342,20 @@ class Pipeline:
         state = None
         if self.config.discrete_state_input:
             state = pad_last(sample.state, self.config.prompt_state_dim or 0)
-        prompt, tagged = sample.prompt, f"{sample.prompt}\n{self.tag}"
-        sample.tokens, sample.token_mask = self._ids(tagged if sample.guidance == 1 else prompt, state)
+        sample.tokens, sample.token_mask = self._ids(sample.prompt, state, tagged=sample.guidance == 1)
         if sample.guidance not in (0, 1):
-            ids, there = self._ids(tagged, state)
+            ids, there = self._ids(sample.prompt, state, tagged=True)
             sample.tagged = ids[there]
 
-    def _ids(self, prompt: str, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def _ids(self, prompt: str, state: np.ndarray | None, *, tagged: bool) -> tuple[np.ndarray, np.ndarray]:
         return self.tokenizer.tokenize(
-            prompt,
+            f"{prompt}\n{self.tag}" if tagged else prompt,
             state,
             max_tokens=self.config.model.max_prompt_tokens,
             as_is=self.config.prompt_as_is,
             labels=self.config.prompt_labels,
             write=self.write,
+            tagged=tagged,
         )
 
     def _pad_state(self, sample: Incoming) -> None:
