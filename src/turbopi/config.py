@@ -43,6 +43,7 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
     "temporal_every": 256,
     "state_dim": 1024,
 }
+MOST_GUIDANCE = 100.0  # scale of guidance by a prompt's tag; 1.5 to 2.5 are in use
 MOST_REMEMBERED = 2048  # observations of an episode that a policy with memory keeps: 1.2 GB for each camera
 
 
@@ -333,6 +334,7 @@ class PolicyConfig:
     num_denoising_steps: int = 10  # the default of a call; so are the next two
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
+    one_step: bool = False  # distilled for one denoising step: no other number makes its actions
     real_time: RealTime = RealTime()
     missing_cameras: MissingCameras = "masked"  # "black": seen as black images, as by openpi's Pi0-FAST
     prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so

@@ -138,6 +138,16 @@ class Backend(ABC):
                 f"backend {cls.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
                 "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
             )
+        if form == "two_prompts":
+            return (
+                f"backend {cls.name!r} has no guidance by a second prompt; take backend 'fused', 'cuda_graph' or "
+                "'pytorch', or guidance 1, which is the prompt with its tag alone, or 0, which is the one without"
+            )
+        if form == "two_prompts_jacobian":
+            return (
+                f"backend {cls.name!r} has no guidance by the true Jacobian (rtc) together with guidance by a second "
+                "prompt; take mode rtc_identity or rtc_trained, guidance 1 or 0, or backend 'pytorch'"
+            )
         what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
         return (
             f"backend {cls.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "

@@ -8,7 +8,7 @@ from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTi
 from turbopi.config import FloatPrecision, Network
 from turbopi.models import family_of
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditionings, Form
+from turbopi.models.pi0.conditioning import Conditionings, Form, has_two_prompts
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.support.errors import BackendError
@@ -23,7 +23,7 @@ class PyTorchBackend(Backend):
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
-    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "two_prompts", "two_prompts_jacobian")
     model_class: ClassVar[type[Pi0Model] | None] = None
     _warm = False
     model: Any  # of the family
@@ -53,7 +53,8 @@ class PyTorchBackend(Backend):
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
         timer = StageTimer(self.device)
-        embedded = self.model.embed(observation.to(self.device))
+        two = {"conditioning": conditioning} if has_two_prompts(conditioning) else {}  # of Pi0's reference alone
+        embedded = self.model.embed(observation.to(self.device), **two)
         timer.mark("vision")  # with the prompt's embedding lookup
         cache = self.model.keys_values(embedded)
         timer.mark("prefix")

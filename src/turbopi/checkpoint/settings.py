@@ -31,6 +31,8 @@ itself.
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
+    target_time           of weights distilled for one denoising step: 0 to 1, or "unused": see target_time.py
+    one_step              true if weights were distilled for one denoising step: other numbers are refused
     missing_cameras       "masked", or "black": seen as black images, as by openpi's Pi0-FAST
     action_tokenizer, max_decoding_steps, broken_answers
                           of Pi0-FAST alone: folder of the action tokenizer, relative to this file; tokens of an answer,
@@ -52,6 +54,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
+from turbopi.checkpoint.target_time import UNUSED, TargetTime
 from turbopi.config import LIMITS, PRESETS, ImageResize, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
 from turbopi.models import family_of
 from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
@@ -68,6 +71,7 @@ ABOUT_WEIGHTS = {
     "action_tokenizer",
     "weights_sha256",
     "lerobot_semantics",
+    "target_time",
 }  # keys of a .json
 ConfigSource = str | Path | PolicyConfig
 
@@ -88,6 +92,11 @@ class Settings:
     def weights_sha256(self) -> str | None:
         expected: str | None = self.values.get("weights_sha256")
         return expected
+
+    @property
+    def target_time(self) -> TargetTime | None:
+        s: TargetTime | None = self.values.get("target_time")
+        return s
 
     @property
     def vision_heads(self) -> int | None:
@@ -148,6 +157,7 @@ _OF_POLICY = (
     "prompt_labels",
     "missing_cameras",
     "num_denoising_steps",
+    "one_step",
     "solver",
     "solver_grid",
     "real_time",
@@ -345,6 +355,14 @@ def _number(value: object) -> float:
     return float(value)
 
 
+def _target_time(value: object) -> TargetTime:
+    if value == UNUSED:
+        return UNUSED
+    if not is_finite(value) or not 0 <= value <= 1:
+        raise ValueError
+    return float(value)
+
+
 def _lora_alpha(value: object) -> dict[str, float]:
     if not isinstance(value, dict):
         return {"vlm": _number(value), "expert": _number(value)}
@@ -386,5 +404,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "max_decoding_steps": _count(LIMITS["max_decoding_steps"]),
     "broken_answers": ("'refuse' or 'owners'", _choice("refuse", "owners")),
     "missing_cameras": ("'masked' or 'black'", _choice("masked", "black")),
+    "target_time": (f"a number from 0 to 1, or {UNUSED!r}", _target_time),
+    "one_step": ("true or false", _flag),
     "weights_sha256": ("64 digits, 0 to 9 and a to f, as `turbopi inspect --hash` shows them", _sha256),
 }

@@ -102,6 +102,10 @@ class TorchSource:
     def native_name(self, name: str) -> str:
         return self._stored[name].key if name in self._stored else self._prefix + self.names.native(name)
 
+    def stored(self, name: str) -> Stored:
+        """Where a parameter is."""
+        return self._stored[name]
+
     def pieces(self, device: torch.device) -> Iterator[Piece]:
         by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))
         for name in by_size:

@@ -66,10 +66,11 @@ class ModelCall:
         """
         if self._backend.begins and not self._memory:
             return self._begin(observations, joins, noise)
-        episodes = [self.see(obs) for obs in observations]
+        episodes = [self.see(obs, joins.guidance) for obs in observations]
         each = [frames[-1][0] for frames in episodes]
         states, readings = [seen.state for seen in each], [self._checks.reading(seen) for seen in each]
-        x_1, conditioning = torch.from_numpy(noise()), self._conditioning.conditioning(joins, states)
+        conditioning = self._conditioning.conditioning(joins, states, [seen.tagged for seen in each])
+        x_1 = torch.from_numpy(self._conditioning.started(joins, states, noise()))
         requested = time.perf_counter()
         with self._turn(observations):
             infer_start = time.perf_counter()
@@ -90,10 +91,10 @@ class ModelCall:
             finally:
                 self._backend.reader = reader
 
-    def see(self, observation: Mapping[str, Any]) -> list[tuple[Incoming, ModelInputs]]:
-        """An observation, the last one, behind the frames that it brings itself."""
+    def see(self, observation: Mapping[str, Any], guidance: float = 0.0) -> list[tuple[Incoming, ModelInputs]]:
+        """An observation, the last one, behind the frames that it brings itself. guidance: `Incoming`'s."""
         frames = given_frames(observation, self._memory) if self._memory else None
-        each = map(self._pipeline.see, [observation] if frames is None else frames)
+        each = [self._pipeline.see(one, guidance=guidance) for one in ([observation] if frames is None else frames)]
         inputs = [(seen, self._pipeline.complete(seen)) for seen in each]
         return inputs if frames is None else [*inputs, inputs[-1]]
 
@@ -112,7 +113,7 @@ class ModelCall:
         return history.with_past(seen.cameras, inputs)
 
     def _begin(self, observations: Sequence[Mapping[str, Any]], joins: Joins, noise: Callable[[], np.ndarray]) -> Ran:
-        each = [self._pipeline.see(obs, resize=False) for obs in observations]
+        each = [self._pipeline.see(obs, resize=False, guidance=joins.guidance) for obs in observations]
         requested = time.perf_counter()
         with self._turn(observations):
             infer_start = time.perf_counter()
@@ -121,8 +122,9 @@ class ModelCall:
             for seen in each:
                 self._pipeline.read(seen)  # while the device is at the first ones' images
             readings = [self._checks.reading(seen) for seen in each]
-            x_1, states = noise(), [seen.state for seen in each]
-            conditioning = self._conditioning.conditioning(joins, states)
+            states = [seen.state for seen in each]
+            x_1 = self._conditioning.started(joins, states, noise())
+            conditioning = self._conditioning.conditioning(joins, states, [seen.tagged for seen in each])
             tokens, state = [seen.tokens[seen.token_mask] for seen in each], np.stack([one.model_state for one in each])
             sample = begun.finish(tokens, state, x_1, joins.steps, conditioning)
             return Ran(sample, states, readings, requested, infer_start, time.perf_counter())

@@ -70,6 +70,11 @@ class UnifiedPolicy:
         solver: "euler", "midpoint", "heun", "ab2" or "exponential" (docs/performance.md). None: the config's.
         time_grid: "uniform", "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1 (noise) to 0,
             which determine the number of steps. None: the config's.
+        guidance_tag: for policies that were trained with and without it (RECAP): the text that training put behind the
+            prompt, such as "Advantage: positive". It goes behind the prompt on a line of its own, and both through the
+            prompt's own clean-up.
+        guidance: scale of classifier-free guidance towards the tag. None: 1, the prompt with the tag alone. 0 is the
+            prompt alone, and any other number up to 100 takes both prompts: docs/performance.md.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache; SmolVLA's in the folder or the Hub's cache (tokenizer.json).
@@ -98,6 +103,8 @@ class UnifiedPolicy:
         num_denoising_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
+        guidance_tag: str | None = None,
         device: str | torch.device = "auto",
         tokenizer: Any = None,
         default_prompt: str | None = None,
@@ -118,10 +125,12 @@ class UnifiedPolicy:
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
         self.config, model = checkpoint.config, checkpoint.config.model
-        self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
+        flow = num_denoising_steps, solver, time_grid, guidance, guidance_tag
+        self._denoising = Denoising.of(self.config, *flow)
         prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         reader = reader_of(checkpoint, prompt_tokenizer)
-        self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
+        edges = checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot, guidance_tag
+        self._pipeline = Pipeline(*edges)
         self._checks = Checks(
             self._pipeline,
             checkpoint.norm_stats,
@@ -152,7 +161,8 @@ class UnifiedPolicy:
             )
         self.backend.strict, self.backend.reader = strict, reader
         self._strict = strict
-        self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
+        own = self._denoising.integration, self._denoising.two_prompts
+        self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, *own)
         self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard, self._checks)
         self._memory = memory_of(model)
         self._history = None if self._memory is None else ObservationHistory(self._memory)
@@ -169,6 +179,7 @@ class UnifiedPolicy:
         num_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
         horizon: int | None = None,
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
@@ -183,7 +194,7 @@ class UnifiedPolicy:
             noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. With noise or a seed the result is
                 deterministic.
             seed: of the noise, by `numpy.random.default_rng(seed)`. Without both: fresh noise every call.
-            num_steps, solver, time_grid: for this call only.
+            num_steps, solver, time_grid, guidance: for this call only.
             horizon: actions of the chunk, H, for this call only. None: the config's, which the weights are trained for.
                 A shorter chunk isn't the beginning of a longer one. Engines for one horizon refuse others.
             previous: the previous chunk, which this one continues (docs/real_time.md); modes: `metadata["real_time"]`.
@@ -214,7 +225,7 @@ class UnifiedPolicy:
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
         joined = of_each("previous", [previous], 1, RunningChunk)
-        requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
+        requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning, guidance)
         histories = self._histories([self._history if history is None else history])
         row = [obs], noises, seed, requested, horizon, own, joined, [model_actions], histories
         return self._infer(*row, hand_over=readings, one_robot=True)[0]
@@ -228,6 +239,7 @@ class UnifiedPolicy:
         num_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
         horizon: int | None = None,
         conditioning: Sequence[Conditioning | None] | None = None,
         previous: Sequence[RunningChunk | None] | None = None,
@@ -251,7 +263,7 @@ class UnifiedPolicy:
         rows = len(observations)
         own = of_each("conditioning", conditioning, rows, Conditioning)
         bringing = next((one for one in own if one is not None and one.brings_steps), None)
-        requested = self._denoising.of_call(num_steps, solver, time_grid, bringing)
+        requested = self._denoising.of_call(num_steps, solver, time_grid, bringing, guidance)
         joined, reported = (
             of_each("previous", previous, rows, RunningChunk),
             flags("model_actions", model_actions, rows),
@@ -280,7 +292,8 @@ class UnifiedPolicy:
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
-        joins = self._conditioning.checked(conditionings, previous, steps, actions, denoising.integration)
+        how = denoising.integration, denoising.guidance
+        joins = self._conditioning.checked(conditionings, previous, steps, actions, *how)
         ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed), histories)
         chunks, readings = self._checks.judge(ran.sample.actions.numpy(), ran.readings)
         results = self._pipeline.after_all(chunks, ran.states)
@@ -317,7 +330,7 @@ class UnifiedPolicy:
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
-        seen = self._pipeline.see(obs)
+        seen = self._pipeline.see(obs, guidance=self._denoising.guidance or 0.0)
         inputs, reading = self._pipeline.complete(seen), self._checks.reading(seen)
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         requested = time.perf_counter()
@@ -459,7 +472,8 @@ class UnifiedPolicy:
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
         """The model's inputs for an episode's first observation. Raises ObservationError if it can't be used."""
-        return self._call.recorded(self._call.see(obs), None if self._memory is None else self.new_history())
+        frames = self._call.see(obs, self._denoising.guidance or 0.0)
+        return self._call.recorded(frames, None if self._memory is None else self.new_history())
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
         """A random observation in this robot's keys, shapes and dtypes."""
@@ -473,8 +487,7 @@ class UnifiedPolicy:
     @property
     def runs_batches(self) -> bool:
         """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
-        integration = self._denoising.integration
-        return self.backend.runs_batches and (integration is None or integration.is_euler)
+        return self.backend.runs_batches and self._denoising.runs_together
 
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:

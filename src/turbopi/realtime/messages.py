@@ -31,7 +31,7 @@ MAX_SEED = 2**64 - 1
 SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot", "traceparent")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
-    *("session", "step", "reset", "seed", "observe"),
+    *("session", "step", "reset", "seed", "observe", "guidance"),
     *SCHEDULING_KEYS,
 )
 
@@ -50,6 +50,7 @@ class CallOptions:
     reset              a new episode: the session's running chunk is forgotten
     seed               draws the noise of this call, as `UnifiedPolicy.infer`'s: the same request, the same answer
     observe            a policy with memory records the observation, and computes nothing
+    prompt_guidance    the key "guidance": the scale of this call, as `UnifiedPolicy.infer`'s
     """
 
     previous: RunningChunk | None = None
@@ -63,6 +64,7 @@ class CallOptions:
     reset: bool = False
     seed: int | None = None
     observe: bool = False
+    prompt_guidance: float | None = None
 
 
 def message(
@@ -137,8 +139,18 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptio
         reset=_flag(given, "reset"),
         seed=_whole(given, "seed", 0, MAX_SEED),
         observe=_flag(given, "observe"),
+        prompt_guidance=_scale(given),
     )
     return observation, options
+
+
+def _scale(given: Mapping[str, Any]) -> float | None:
+    if "guidance" not in given:
+        return None
+    scale = as_number(given["guidance"])
+    if scale is None:
+        raise ObservationError(f"{PREFIX}guidance is {given['guidance']!r:.100}; it should be a number")
+    return float(scale)
 
 
 def _left_over(given: Mapping[str, Any]) -> np.ndarray | None:

@@ -201,7 +201,7 @@ class PolicyCalls:
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
         request.call = _Call([observation], arguments, request.answer)
-        request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
+        request.joins = bool(arguments.keys() - {"seed", "guidance", "history", OBSERVE})
         request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
         results = self.worker.submit(request)
         if self._pipelined and not arguments:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.config import MOST_GUIDANCE
 from turbopi.realtime.messages import NOTE_KINDS, NOTES, PREFIX
 from turbopi.serve.http_api import ACTIONS, JSON, KINDS, MSGPACK, REFUSED
 from turbopi.serve.json_messages import to_json
@@ -30,6 +31,7 @@ OPTIONS: dict[str, dict[str, Any]] = {  # a request's keys behind "turbopi/", wh
     "session": _TEXT,
     "step": _COUNT,
     "reset": _YES,
+    "guidance": {"type": "number", "minimum": 0, "maximum": MOST_GUIDANCE},
     "seed": _COUNT,
     "observe": _YES,
     "deadline_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_DEADLINE_MS},

@@ -87,7 +87,7 @@ class RealTime:
         offered = metadata.get("real_time")
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
-        self._remembers = "memory" in metadata
+        self._remembers, self._guided = "memory" in metadata, "guidance" in metadata
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         # Those with a chunk, the one that got its chunk last at the end, and those with only a request.
         self._named: OrderedDict[str, _Session] = OrderedDict()
@@ -142,8 +142,12 @@ class RealTime:
         observation, requested = read_message(received)
         if requested.observe and not self._remembers:
             raise ObservationError(f"{PREFIX}observe is for a policy with memory, and this server's has none")
-        seeded = _seed(requested)
-        if self._joins_nothing(requested, unconditioned) and (self._modes or not seeded):
+        seeded = _of_call(requested)
+        if "guidance" in seeded and not self._guided:
+            raise ObservationError(
+                f"{PREFIX}guidance is for a policy with a tag, and this server's has none: start it with --guidance-tag"
+            )
+        if self._joins_nothing(requested, unconditioned) and (self._modes or "seed" not in seeded):
             return Plan(observation, seeded, requested, name=requested.session)
         if not self._modes:
             raise ObservationError(
@@ -177,7 +181,7 @@ class RealTime:
 
     def _joins_nothing(self, requested: CallOptions, unconditioned: bool) -> bool:
         """Whether a request needs no chunk. `unconditioned`: its mode is NO_JOINING. Raises ObservationError."""
-        of_chunk = replace(requested, seed=None, observe=False)
+        of_chunk = replace(requested, seed=None, observe=False, prompt_guidance=None)
         if self._remembers:  # these are of its history, too
             of_chunk = replace(of_chunk, reset=False, step=None)
         plain = of_chunk == CallOptions(session=requested.session)
@@ -208,7 +212,7 @@ class RealTime:
             about |= more
         elif requested.step is None:
             self._need_control_hz()
-        arguments = {"previous": previous, "model_actions": True, **_seed(requested)}
+        arguments = {"previous": previous, "model_actions": True, **_of_call(requested)}
         plan = Plan(observation, arguments, requested, session, requested.session, now, connection, about)
         session.chunk = chunk
         session.pending.append(plan)
@@ -406,9 +410,10 @@ def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon:
         )
 
 
-def _seed(requested: CallOptions) -> dict[str, Any]:
-    """The argument of `infer`, if the client chose one."""
-    return {} if requested.seed is None else {"seed": requested.seed}
+def _of_call(requested: CallOptions) -> dict[str, Any]:
+    """Arguments of `infer` that the client chose, and that have nothing to do with chunks."""
+    chosen = {"seed": requested.seed, "guidance": requested.prompt_guidance}
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _named(received: Mapping[str, Any]) -> str:

@@ -57,6 +57,7 @@ class EmbeddedPrefix:
     layout: PrefixLayout
     lengths: Tensor  # int64[B]  valid prefix tokens
     state: Tensor  # float32[B, action_dim]
+    tagged: "EmbeddedPrefix | None" = None  # the same images with the prompt of `PromptGuidance`
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,11 @@ class KVCache:
     mask: Tensor | None  # bool[B, S]; None: every slot is valid
     lengths: Tensor  # int64[B]  valid prefix tokens; the suffix's positions go on from here
     state: Tensor  # float32[B, action_dim]  Pi0's suffix starts with it; Pi0.5 ignores it
+    tagged: "KVCache | None" = None  # of the prompt of `PromptGuidance`
 
     def row(self, row: int) -> "KVCache":
         """One observation's alone, masked as before."""
         one = slice(row, row + 1)
         mask = None if self.mask is None else self.mask[one]
-        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one])
+        tagged = None if self.tagged is None else self.tagged.row(row)
+        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one], tagged)
