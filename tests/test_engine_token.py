@@ -15,7 +15,8 @@ from turbopi.models.observation import Observation
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import token
-from turbopi.models.pi0_fast.reference import Decoding, Pi0FastModel, compacted
+from turbopi.models.pi0.decoding import Decoding
+from turbopi.models.pi0_fast.reference import Pi0FastModel, compacted
 
 pytestmark = gpu_or_interpreter()
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -23,8 +23,9 @@ from turbopi.engine.resize import Resizer
 from turbopi.models import family_of
 from turbopi.models.observation import Observation, Past
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0_fast.reference import Decoding, compacted
+from turbopi.models.pi0_fast.reference import compacted
 from turbopi.preprocess.pipeline import of_row
 from turbopi.support.errors import ActionError, ObservationError
 

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from turbopi.config import Pi0FastConfig
 from turbopi.kernels.portable import token as kernels
+from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0.layers import rope_tables
-from turbopi.models.pi0_fast.reference import Decoding, Pi0FastModel
+from turbopi.models.pi0_fast.reference import Pi0FastModel
 
 
 def refuses(config: Pi0FastConfig) -> str | None:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from turbopi.config import FloatPrecision, Kind
+from turbopi.models.pi0.decoding import Ending
 
 
 class Pieces(Protocol):
@@ -21,17 +22,8 @@ class Pieces(Protocol):
     def vocab_size(self) -> int: ...
 
 
-class AnswerReader(Protocol):
-    """What makes actions of the ids that a model wrote.
-
-    ends  ids at which an answer may be over; `over` decides it
-    """
-
-    @property
-    def ends(self) -> Sequence[int]: ...
-
-    def over(self, ids: Sequence[int]) -> bool:
-        """Whether what follows these ids, the last of which is one of `ends`, changes no action."""
+class AnswerReader(Ending, Protocol):
+    """What makes actions of the ids that a model wrote. What follows an answer's end changes no action."""
 
     def actions(self, ids: Sequence[int]) -> NDArray[np.float32]:
         """float32[H, action_dim], normalised. Raises ActionError for a broken answer."""
