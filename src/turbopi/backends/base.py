@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from turbopi.checkpoint.base import Room
-from turbopi.config import FloatPrecision, ImageResize, Network
+from turbopi.config import FloatPrecision, ImageResize, Network, TextConfig
 from turbopi.models import family_of
 from turbopi.models.family import AnswerReader
 from turbopi.models.observation import Observation
@@ -23,6 +23,7 @@ from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Trace
 from turbopi.models.pi0.sample import Sample
+from turbopi.models.pi0.text import TextWriter
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import Precision
 from turbopi.support.errors import BackendError, ConfigError, ObservationError
@@ -67,6 +68,7 @@ class Backend(ABC):
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
     reader          of a model that writes its actions as tokens: what makes actions of them. Set by the policy
+    writer          what writes text, once `prepare_text` was called
     """
 
     name: ClassVar[str]
@@ -78,6 +80,7 @@ class Backend(ABC):
     submits: ClassVar[bool] = False
     strict = False
     reader: AnswerReader | None = None
+    writer: TextWriter | None = None
 
     config: Any  # a Network; a backend that plans says `ModelConfig`
 
@@ -158,6 +161,12 @@ class Backend(ABC):
             f"backend {self.name!r} has engines for the config's action horizon of {self.config.action_horizon}, not "
             f"for {horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
         )
+
+    def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:  # noqa: B027  (a default, not a hole)
+        """Make `writer` around a Pi0.5's language model. Here: nothing, so that it writes no text.
+
+        head  [V, D]; None: the embedding table is the head
+        """
 
     # -- before calls --------------------------------------------------------------------------------------------------
 

@@ -5,12 +5,13 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
-from turbopi.config import FloatPrecision, Network
+from turbopi.config import FloatPrecision, Network, TextConfig
 from turbopi.models import family_of
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Pi0Model, Trace
+from turbopi.models.pi0.text import TextWriter
 from turbopi.support.errors import BackendError
 
 
@@ -32,6 +33,10 @@ class PyTorchBackend(Backend):
         precision: FloatPrecision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
         model_class = self.model_class or family_of(self.config).reference
         self.model = model_class.from_state(self.config, load(self.device, precision))
+
+    def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
+        if type(self) is PyTorchBackend:  # what derives from it computes otherwise
+            self.writer = TextWriter(self.model, text, head)
 
     @classmethod
     def refuses_model(cls, config: Network) -> str | None:

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from torch import Tensor
 
 from turbopi.checkpoint import known_hashes
+from turbopi.checkpoint.names import EMBEDDING
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
 from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig, memory_of
@@ -139,6 +140,25 @@ class Checkpoint:
             torch.cuda.current_stream(room.device).synchronize()  # not the device: others may be capturing
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
+
+    def load_head(self, device: torch.device | str, precision: FloatPrecision) -> Tensor | None:
+        """The language head [V, D] of a Pi0.5 that writes text; None: its embedding table is the head.
+
+        Raises CheckpointError for an adapter's, and if a value is NaN or infinite.
+        """
+        untied = getattr(self.source, "untied_head", None)
+        if untied is None:
+            if self.format == "lerobot":
+                raise CheckpointError(
+                    f"{self.path} is an adapter, whose language head isn't read: merge it into its base model there "
+                    "(merge_and_unload), and save that"
+                )
+            return None
+        found: Tensor | None = untied()
+        if found is None:
+            return None
+        check_finite(found, "lm_head.weight", self.path)
+        return found.to(device, family_of(self.config.model).parameter_dtype(EMBEDDING, precision, self.config.model))
 
     def check_hash(self) -> None:
         """Raise CheckpointError if the weights' SHA-256 isn't the one in the configuration, if it has one."""

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from turbopi.config import FloatPrecision, Kind
-from turbopi.models.pi0.decoding import Ending
 
 
 class Pieces(Protocol):
@@ -20,6 +19,19 @@ class Pieces(Protocol):
     def encode(self, text: str) -> list[int]: ...
     def decode(self, ids: list[int]) -> str: ...
     def vocab_size(self) -> int: ...
+
+
+class Ending(Protocol):
+    """When an answer that is written id by id is over.
+
+    ends  ids at which it may be; `over` decides
+    """
+
+    @property
+    def ends(self) -> Sequence[int]: ...
+
+    def over(self, ids: Sequence[int]) -> bool:
+        """Whether an answer is over behind these ids, the last of which is one of `ends`."""
 
 
 class AnswerReader(Ending, Protocol):

@@ -47,6 +47,10 @@ def checked_batch(size: int, error: Error) -> int:
     return _checked("the size of a batch", size, MAX_BATCH, error)
 
 
+def checked_tokens(tokens: int, most: int) -> int:
+    return _checked("max_tokens", tokens, most, ObservationError)
+
+
 def _checked(what: str, number: int, most: int, error: Error) -> int:
     whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     if not whole or not 1 <= number <= most:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.realtime.messages import NOTE_KINDS, NOTES, PREFIX
+from turbopi.realtime.messages import MAX_TOKENS, NOTE_KINDS, NOTES, PREFIX
 from turbopi.serve.http_api import ACTIONS, JSON, KINDS, MSGPACK, REFUSED
 from turbopi.serve.json_messages import to_json
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
@@ -32,6 +32,9 @@ OPTIONS: dict[str, dict[str, Any]] = {  # a request's keys behind "turbopi/", wh
     "reset": _YES,
     "seed": _COUNT,
     "observe": _YES,
+    "subtask": _TEXT,
+    "generate": {"type": ["boolean", "string"]},
+    "max_tokens": {"type": "integer", "minimum": 1, "maximum": MAX_TOKENS},
     "deadline_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_DEADLINE_MS},
     "control_hz": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_CONTROL_HZ},
     "left": {"type": "integer", "minimum": 1},

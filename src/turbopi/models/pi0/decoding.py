@@ -12,29 +12,17 @@ Shapes: B batch, S prefix places, N tokens of an answer at most, V vocabulary, D
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from turbopi.models.family import Ending
 from turbopi.models.pi0.gemma import Gemma
 from turbopi.models.pi0.layers import gated_residual, rope_tables
 from turbopi.models.pi0.prefix import embed_prompt
 
 BOS, EOS = 2, 1  # of PaliGemma's SentencePiece model
-
-
-class Ending(Protocol):
-    """When an answer is over.
-
-    ends  ids at which it may be; `over` decides
-    """
-
-    @property
-    def ends(self) -> Sequence[int]: ...
-
-    def over(self, ids: Sequence[int]) -> bool:
-        """Whether an answer is over behind these ids, the last of which is one of `ends`."""
 
 
 @dataclass(frozen=True)
