@@ -373,6 +373,11 @@ class PolicyConfig:
     text: TextConfig | None = None  # what it writes; None: nothing says that its language head was trained
 
     @property
+    def writes_subtasks(self) -> bool:
+        """Whether it writes the subtasks that its actions are made of."""
+        return self.text is not None and self.text.trained and self.text.subtasks is not None
+
+    @property
     def planned_model(self) -> ModelConfig:
         """`model`, for what Pi0 and Pi0.5 alone have: engines, quantization, their own plan and roofline.
 

@@ -25,6 +25,7 @@ class PyTorchBackend(Backend):
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
+    writes: ClassVar[bool] = True
     model_class: ClassVar[type[Pi0Model] | None] = None
     _warm = False
     model: Any  # of the family
@@ -35,8 +36,7 @@ class PyTorchBackend(Backend):
         self.model = model_class.from_state(self.config, load(self.device, precision))
 
     def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
-        if type(self) is PyTorchBackend:  # what derives from it computes otherwise
-            self.writer = TextWriter(self.model, text, head)
+        self.writer = TextWriter(self.model, text, head)
 
     @classmethod
     def refuses_model(cls, config: Network) -> str | None:

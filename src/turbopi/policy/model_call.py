@@ -72,7 +72,7 @@ class ModelCall:
         text = self._text if subtasks else None
         if text is not None:
             text.check(subtasks)
-        if self._backend.begins and not self._memory:
+        if self._backend.begins and not self._memory and not (text is not None and text.writes):
             return self._begin(observations, joins, noise, subtasks)
         episodes = [self.see(obs) for obs in observations]
         each = [frames[-1][0] for frames in episodes]

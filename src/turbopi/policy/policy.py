@@ -144,21 +144,18 @@ class UnifiedPolicy:
 
         calibration = for_policy(quantization, precision, checkpoint)
         self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
-        text = self.config.text
-        if backend == "auto" and precision in ("bf16", "f32") and text is not None and text.trained and text.subtasks:
-            name, why = "pytorch", "auto: the one that writes the subtasks that this policy acts on"
-        elif backend == "auto":  # when all that was given is known to be good
-            backends.qualified(self._device, precision, model, bar=progress)
-            name, why = backends.choose(self._device, precision, model)
+        text, writes = self.config.text, self.config.writes_subtasks
+        if backend == "auto":  # when all that was given is known to be good
+            backends.qualified(self._device, precision, model, bar=progress, writes=writes)
+            name, why = backends.choose(self._device, precision, model, writes=writes)
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
-                name, model, load, device=self._device, precision=precision, quantization=calibration
+                name, model, load, device=self._device, precision=precision, quantization=calibration, writes=writes
             )
-            if text is not None and text.trained and name == "pytorch":
-                self.backend.prepare_text(
-                    text, checkpoint.load_head(self._device, "bf16" if precision == "bf16" else "f32")
-                )
+            if text is not None and text.trained and self.backend.writes:
+                head = checkpoint.load_head(self._device, "bf16" if precision == "bf16" else "f32")
+                self.backend.prepare_text(text, head)
         self.backend.strict, self.backend.reader = strict, reader
         self._strict = strict
         self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)

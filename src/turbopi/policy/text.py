@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends.base import StageTimer
+from turbopi.backends.base import StageTimer, TextWriting
 from turbopi.config import PolicyConfig
 from turbopi.models.observation import ModelInputs, Observation, SeenObservation
 from turbopi.models.pi0.conditioning import Conditionings, of_rows
 from turbopi.models.pi0.sample import Sample
-from turbopi.models.pi0.text import TextWriter
 from turbopi.policy.history import History
 from turbopi.preprocess.pipeline import Incoming, Pipeline
 from turbopi.preprocess.text_prompts import joint_ids, text_ids, text_of
@@ -82,18 +81,20 @@ class TextCalls:
         """Raise ObservationError for a chunk whose subtask nobody can tell."""
         if self.writes:
             return
-        what = "writes no subtasks, and this policy acts on them: give `subtask`, or take backend 'pytorch'"
         if self._config.trained and any(one is None for one in given):
-            raise ObservationError(f"backend {self._backend.name!r} {what}")
+            raise ObservationError(
+                f"backend {self._backend.name!r} writes no subtasks, and this policy acts on them: give `subtask`, or "
+                "take backend 'cuda_graph' or 'pytorch'"
+            )
         if self._config.subtasks is not None and self._config.subtasks.joint:
             raise ObservationError(
                 f"backend {self._backend.name!r} has no causal prompts, in which this policy reads its subtasks "
-                "(joint_subtask_conditioning): take backend 'pytorch'"
+                "(joint_subtask_conditioning): take backend 'cuda_graph' or 'pytorch'"
             )
 
     def write(self, seen: Incoming, inputs: ModelInputs, prompt: str | None, most: int | None) -> str:
         """What it says to one observation. prompt: in place of the observation's."""
-        observation = self._writer.see(Observation.stack([inputs]).to(self._backend.device))
+        observation = self._writer.see(Observation.stack([inputs]))
         return self._written(seen, observation, prompt, self._config.max_tokens if most is None else most)
 
     def sample(
@@ -111,7 +112,7 @@ class TextCalls:
         of_each = zip(each, inputs, given, histories, of_rows(conditioning, len(each)), strict=True)
         for row, (seen, its, own, history, one) in enumerate(of_each):
             timer = StageTimer(self._backend.device)
-            observation = self._writer.see(Observation.stack([its]).to(self._backend.device))
+            observation = self._writer.see(Observation.stack([its]))
             timer.mark("vision")
             subtask = self._next(seen, observation, history) if own is None else own
             timer.mark("text")
@@ -134,7 +135,7 @@ class TextCalls:
         return inputs
 
     @property
-    def _writer(self) -> TextWriter:
+    def _writer(self) -> TextWriting:
         assert self._backend.writer is not None
         return self._backend.writer
 
@@ -168,11 +169,10 @@ class TextCalls:
         limit = self._pipeline.config.model.max_prompt_tokens
         if len(ids) > limit:
             raise ObservationError(f"the prompt takes {len(ids)} tokens; expected at most {limit} (max_prompt_tokens)")
-        device = self._backend.device
-        tokens = torch.tensor(ids, device=device)[None]
+        tokens = torch.tensor(ids)[None]
         return replace(
             observation,
             tokens=tokens,
             token_mask=torch.ones_like(tokens, dtype=torch.bool),
-            causal=None if causal is None else torch.tensor(causal, device=device)[None],
+            causal=None if causal is None else torch.tensor(causal)[None],
         )

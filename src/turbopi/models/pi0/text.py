@@ -25,6 +25,9 @@ class _ToEos:
         return True
 
 
+TO_EOS = _ToEos()
+
+
 def never_written(text: TextConfig, vocab_size: int) -> tuple[tuple[int, int], ...]:
     """Ranges of ids that LeRobot's pi052 never chooses: FAST's action tokens up to the locations, and these."""
     if text.skipped_ids is None:
@@ -54,9 +57,8 @@ class TextWriter(Writer):
     @exact_float32()
     def see(self, observation: Observation) -> SeenObservation:
         """An observation with its images embedded: for the text, and for the actions behind it."""
-        return SeenObservation.of(
-            observation, self.model.embed_cameras(observation, camera_slots(observation, compact=True))
-        )
+        here = observation.to(self.model.device)
+        return SeenObservation.of(observation, self.model.embed_cameras(here, camera_slots(here, compact=True)))
 
     @torch.no_grad()
     @exact_float32()
@@ -65,10 +67,10 @@ class TextWriter(Writer):
 
         keep  as `Writer.finish`
         """
-        embedded = self.model.embed(observation)
+        embedded = self.model.embed(observation.to(self.model.device))
         b, s = embedded.embs.shape[:2]
         assert b == 1 and embedded.layout.causal is None
-        decoding = self.buffers_for(b, s, most, _ToEos.ends)
+        decoding = self.buffers_for(b, s, most, TO_EOS.ends)
         self.read_prefix(decoding, embedded.embs, torch.ones(b, s, dtype=torch.bool, device=embedded.embs.device))
-        rows, kept = self.finish(decoding, _ToEos(), most, keep=keep)
+        rows, kept = self.finish(decoding, TO_EOS, most, keep=keep)
         return rows[0], kept
