@@ -3,12 +3,16 @@
 import json
 import lzma
 import shutil
+import urllib.request
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from checkpoint_helpers import edit_json
+from lerobot_golden import GOLDEN as LEROBOT
+from lerobot_golden import GoldenCase
 from pi0_fast_golden import TOKENIZER
 from replayed_graphs import Replayed, replay_on_cpu
 from safetensors.numpy import load_file, save_file
@@ -24,8 +28,11 @@ from turbopi.models.observation import Observation
 from turbopi.models.pi0.text import never_written
 from turbopi.policy.text import SubtaskHistory
 from turbopi.preprocess.text_prompts import text_ids
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 from turbopi.realtime import RealTimeClient
+from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import running
+from turbopi.support.action_groups import task_of
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
 
 GOLDEN = Path(__file__).parent / "golden_text"
@@ -272,6 +279,24 @@ def test_auto_takes_the_backend_that_writes(tmp_path: Path) -> None:
     assert policy.backend.name == "pytorch" and "that writes subtasks" in policy.metadata["backend_reason"]
 
 
+def test_inspect_says_what_is_written(tmp_path: Path) -> None:
+    folder = make_folder("joint", tmp_path / "c", subtask_replan_steps=8)
+    result = CliRunner().invoke(app, ["inspect", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert "a subtask for 2 chunks, joint" in " ".join(result.output.replace("│", " ").split())
+    assert open_checkpoint(folder).info()["text"]["subtasks"] == {"chunks": 2, "joint": True}
+
+
+def test_a_head_beside_a_pi05_s_embedding_is_used_where_settings_say_that_it_was_trained(tmp_path: Path) -> None:
+    folder = GoldenCase(LEROBOT / "trained_embedding").assemble(tmp_path)
+    edit_json(folder / "turbopi.json", lambda said: said.update(text={"template": "{prompt}:", "max_tokens": 3}))
+    policy = policy_of(folder, tokenizer=TINY_TOKENIZER)
+    tensors, writer = load_file(folder / "model.safetensors"), cast("Any", policy.backend.writer)
+    assert np.array_equal(writer.head.numpy(), tensors[HEAD])
+    assert np.array_equal(writer.vlm.embed_tokens.weight.numpy(), tensors[EMBEDDING])
+    assert isinstance(policy.generate(policy.example_observation()), str)
+
+
 # -- a head that the user says was trained -----------------------------------------------------------------------------
 
 
@@ -338,6 +363,11 @@ def test_a_server_writes_and_holds_subtasks_of_each_robot(policies: dict[str, Un
         assert client.generate(golden.observation(0), prompt="Go home", max_tokens=3) != "open the drawer"
         said = [client.infer(golden.observation(run))["subtask"] for run in (0, 1, 2)]
         assert said == ["open the drawer", "open the drawer", "grasp it"]
+        sent = pack(golden.observation(0) | {"turbopi/generate": True})  # by HTTP, without a session
+        headers = {"Content-Type": "application/msgpack"}
+        url = f"http://127.0.0.1:{server.port}/v1/actions"
+        with urllib.request.urlopen(urllib.request.Request(url, sent, headers)) as reply:
+            assert unpack(reply.read())["text"] == "open the drawer"
         with RealTimeClient("127.0.0.1", server.port) as other:
             assert other.infer(golden.observation(3))["subtask"] == "Go home"
         given = client.infer(golden.observation(0) | {"turbopi/subtask": "wave"})
@@ -376,6 +406,12 @@ def test_a_server_without_text_refuses_its_keys(tmp_path: Path) -> None:
             with pytest.raises(ObservationError, match="this server's doesn't"):
                 client.infer(observation | {f"turbopi/{key}": value})
         assert "subtask" not in client.infer(observation)
+
+
+def test_a_subtask_is_shown_behind_the_prompt() -> None:
+    assert task_of({"task": "tidy"}, {"subtask": "grasp it"}) == "tidy → grasp it"
+    for answer in ({}, {"subtask": "tidy"}, {"subtask": 3}):
+        assert task_of({"task": "tidy"}, answer) == "tidy"
 
 
 def test_the_command_prints_what_is_written(tmp_path: Path) -> None:

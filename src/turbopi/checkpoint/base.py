@@ -226,6 +226,7 @@ class Checkpoint:
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
             "memory": None if (memory := memory_of(self.config.model)) is None else asdict(memory),
+            "text": None if self.config.text is None else asdict(self.config.text),
             "normalization": {
                 "state": self.config.normalization.state,
                 "actions": self.config.normalization.actions,

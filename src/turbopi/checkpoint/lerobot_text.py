@@ -44,7 +44,7 @@ class TextFolder(LeRobotFolder):
         )
         # LeRobot cuts no prompt at inference, and a subtask may be as long as an answer
         longest = min(self.pipelines.max_tokens + text.max_tokens, LIMITS["max_prompt_tokens"])
-        return replace(described, text=text).with_model(max_prompt_tokens=longest)
+        return replace(described, name="lerobot_pi052", text=text).with_model(max_prompt_tokens=longest)
 
     @property
     def _trains_head(self) -> bool:
