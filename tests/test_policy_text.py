@@ -354,6 +354,25 @@ def test_settings_of_text_are_for_pi05_that_does_not_describe_itself(tmp_path: P
 # -- over the wire, and as a command -----------------------------------------------------------------------------------
 
 
+BAD_KEYS: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"subtask": ""}, "turbopi/subtask is ''; it should be a text of 1 to 2000 characters"),
+    ({"subtask": 3}, "turbopi/subtask is 3"),
+    ({"subtask": "x" * 2001}, "turbopi/subtask is 'xxx"),
+    ({"generate": 1}, "turbopi/generate is 1; it should be true, or the prompt as a text of 1 to 2000"),
+    ({"generate": " "}, "turbopi/generate is ' '"),
+    ({"max_tokens": 3}, "turbopi/max_tokens came without turbopi/generate"),
+    (
+        {"generate": True, "max_tokens": 0},
+        "turbopi/max_tokens is 0; it should be a whole number from 1 to 1000",
+    ),
+    ({"generate": True, "max_tokens": 999}, "max_tokens is 999; it should be a whole number from 1 to 128"),
+    ({"generate": True, "subtask": "wave"}, "turbopi/generate asks for a text and no actions"),
+    ({"generate": True, "model_actions": True}, "turbopi/generate asks for a text and no actions"),
+    ({"batch": 1, "generate": True}, "turbopi/batch"),
+    ({"batch": 1}, "turbopi/batch came to a policy with memory"),
+)
+
+
 def test_a_server_writes_and_holds_subtasks_of_each_robot(policies: dict[str, UnifiedPolicy]) -> None:
     policy, golden = policies["subtasks"], runs("subtasks")
     with running(policy) as server, RealTimeClient("127.0.0.1", server.port) as client:
@@ -363,37 +382,21 @@ def test_a_server_writes_and_holds_subtasks_of_each_robot(policies: dict[str, Un
         assert client.generate(golden.observation(0), prompt="Go home", max_tokens=3) != "open the drawer"
         said = [client.infer(golden.observation(run))["subtask"] for run in (0, 1, 2)]
         assert said == ["open the drawer", "open the drawer", "grasp it"]
-        sent = pack(golden.observation(0) | {"turbopi/generate": True})  # by HTTP, without a session
+        sent = pack({**golden.observation(0), "turbopi/generate": True})  # by HTTP, without a session
         headers = {"Content-Type": "application/msgpack"}
         url = f"http://127.0.0.1:{server.port}/v1/actions"
         with urllib.request.urlopen(urllib.request.Request(url, sent, headers)) as reply:
             assert unpack(reply.read())["text"] == "open the drawer"
         with RealTimeClient("127.0.0.1", server.port) as other:
             assert other.infer(golden.observation(3))["subtask"] == "Go home"
-        given = client.infer(golden.observation(0) | {"turbopi/subtask": "wave"})
+        given = client.infer({**golden.observation(0), "turbopi/subtask": "wave"})
         assert given["subtask"] == "wave" and "memory" not in given
         client.reset()
         assert client.infer(golden.observation(3))["subtask"] == "Go home"
-        for keys, message in (
-            ({"subtask": ""}, "turbopi/subtask is ''; it should be a text of 1 to 2000 characters"),
-            ({"subtask": 3}, "turbopi/subtask is 3"),
-            ({"subtask": "x" * 2001}, "turbopi/subtask is 'xxx"),
-            ({"generate": 1}, "turbopi/generate is 1; it should be true, or the prompt as a text of 1 to 2000"),
-            ({"generate": " "}, "turbopi/generate is ' '"),
-            ({"max_tokens": 3}, "turbopi/max_tokens came without turbopi/generate"),
-            (
-                {"generate": True, "max_tokens": 0},
-                "turbopi/max_tokens is 0; it should be a whole number from 1 to 1000",
-            ),
-            ({"generate": True, "max_tokens": 999}, "max_tokens is 999; it should be a whole number from 1 to 128"),
-            ({"generate": True, "subtask": "wave"}, "turbopi/generate asks for a text and no actions"),
-            ({"generate": True, "model_actions": True}, "turbopi/generate asks for a text and no actions"),
-            ({"batch": 1, "generate": True}, "turbopi/batch"),
-            ({"batch": 1}, "turbopi/batch came to a policy with memory"),
-        ):
+        for keys, message in BAD_KEYS:
             sent = {f"turbopi/{key}": value for key, value in keys.items()}
             with pytest.raises(ObservationError, match=message):
-                client.infer(golden.observation(0) | sent)
+                client.infer({**golden.observation(0), **sent})
 
 
 def test_a_server_without_text_refuses_its_keys(tmp_path: Path) -> None:

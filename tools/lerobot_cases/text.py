@@ -78,11 +78,11 @@ def main(folder: Path) -> None:
 
 def _observation(index: int) -> dict[str, Any]:
     random = np.random.default_rng(index)
-    pictures = {
+    images = {
         f"observation.images.{name}": np.kron(random.integers(0, 256, (3, 4, 3)), np.ones((24, 24, 1))).astype(np.uint8)
         for name in CAMERAS
     }
-    return pictures | {"observation.state": random.uniform(-2, 2, STATE).astype(np.float32), "task": TASKS[index]}
+    return images | {"observation.state": random.uniform(-2, 2, STATE).astype(np.float32), "task": TASKS[index]}
 
 
 def _policy(case: Case) -> Any:
