@@ -382,10 +382,10 @@ def test_a_server_writes_and_holds_subtasks_of_each_robot(policies: dict[str, Un
         assert client.generate(golden.observation(0), prompt="Go home", max_tokens=3) != "open the drawer"
         said = [client.infer(golden.observation(run))["subtask"] for run in (0, 1, 2)]
         assert said == ["open the drawer", "open the drawer", "grasp it"]
-        sent = pack({**golden.observation(0), "turbopi/generate": True})  # by HTTP, without a session
+        posted = pack({**golden.observation(0), "turbopi/generate": True})  # by HTTP, without a session
         headers = {"Content-Type": "application/msgpack"}
         url = f"http://127.0.0.1:{server.port}/v1/actions"
-        with urllib.request.urlopen(urllib.request.Request(url, sent, headers)) as reply:
+        with urllib.request.urlopen(urllib.request.Request(url, posted, headers)) as reply:
             assert unpack(reply.read())["text"] == "open the drawer"
         with RealTimeClient("127.0.0.1", server.port) as other:
             assert other.infer(golden.observation(3))["subtask"] == "Go home"
