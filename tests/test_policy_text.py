@@ -216,6 +216,7 @@ def test_a_head_that_is_the_embedding_is_loaded_once(tmp_path: Path) -> None:
         ({"apply_chat_template": True}, "apply_chat_template = True, which Turbo-Pi doesn't compute"),
         ({"memory_scratchpad": True}, "memory_scratchpad = True, which Turbo-Pi doesn't compute"),
         ({"use_visual_memory": True}, "has memory .* and type 'pi052'"),
+        ({"joint_subtask_conditioning": True, "unfreeze_lm_head": False}, "the language head wasn't trained"),
         ({"n_action_steps": 0}, "n_action_steps is 0"),
         ({"joint_subtask_conditioning": 1}, "joint_subtask_conditioning is 1"),
         ({"type": "pi05"}, "has a step 'render_messages_processor' that Turbo-Pi doesn't know"),

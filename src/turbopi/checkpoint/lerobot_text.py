@@ -32,6 +32,11 @@ class TextFolder(LeRobotFolder):
         if self.memory is not None:
             raise CheckpointError(f"{self.file} has memory (MEM) and type 'pi052'; LeRobot has memory in pi05 alone")
         joint = config.flag("joint_subtask_conditioning", False)
+        if joint and not self._trains_head:
+            raise CheckpointError(
+                f"{self.file} has joint_subtask_conditioning = True, whose actions see a written subtask, but the "
+                "language head wasn't trained (text_loss_weight, unfreeze_lm_head)"
+            )
         replan = config.integer(
             "subtask_replan_steps", -(LIMITS["action_horizon"] ** 2), LIMITS["action_horizon"] ** 2, 0
         )
