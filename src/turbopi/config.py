@@ -18,6 +18,7 @@ from turbopi.support.reading import is_finite, is_integer, shown
 PiKind = Literal["pi05", "pi0"]
 Kind = Literal["pi05", "pi0", "pi0_fast", "smolvla"]
 WITH_MEMORY: tuple[Kind, ...] = ("pi05",)  # LeRobot has `MemoryConfig` in it alone
+WITH_TEXT: tuple[Kind, ...] = ("pi05",)  # what may have `TextConfig`
 FloatPrecision = Literal["bf16", "f32"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 

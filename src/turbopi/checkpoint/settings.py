@@ -57,6 +57,7 @@ from turbopi.checkpoint.openpi_lora import LoraScale
 from turbopi.config import (
     LIMITS,
     PRESETS,
+    WITH_TEXT,
     ImageResize,
     Kind,
     Normalization,
@@ -199,7 +200,7 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
 
 
 def _check_text(config: PolicyConfig, source: str) -> None:
-    if config.model.kind != "pi05" or memory_of(config.model) is not None:
+    if config.model.kind not in WITH_TEXT or memory_of(config.model) is not None:
         raise ConfigError(f"{source}: text can't be chosen for {family_of(config.model).label}; it is for Pi0.5")
     if config.text is not None:
         raise ConfigError(f"{source}: text can't be chosen for LeRobot's pi052, whose config.json describes it")
