@@ -426,5 +426,7 @@ def test_the_command_prints_what_is_written(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, arguments + options)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["text"] == ["open the drawer"]
+    acted = CliRunner().invoke(app, [*arguments[:3], "-o", str(tmp_path / "a.npz"), "--no-plot", *options])
+    assert acted.exit_code == 0 and "subtask: 'open the drawer'" in acted.output
     refused = CliRunner().invoke(app, [*arguments, "--seed", "1"])
     assert refused.exit_code != 0 and "--generate makes no actions" in refused.output

@@ -181,7 +181,7 @@ def _print_text(
     for source in sources:
         with _naming(source):
             texts.append(policy.generate(load_observation(source), prompt=prompt or None))
-        output.line(texts[-1])
+        output.line("".join(letter if letter.isprintable() else "?" for letter in texts[-1]))
     output.document({"text": texts, "policy": policy.metadata})
 
 
@@ -304,6 +304,8 @@ def _run(
             with _naming(source):
                 result = policy.infer(observation, noise=noise, readings=True)
             notes = noted.of(source, result.get(READING))
+            if "subtask" in result:
+                noted.output.line(f"subtask: {result['subtask']!r}")
             kept = observation if number < MAX_ROWS else None
             answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"], notes))
     return answers

@@ -166,6 +166,8 @@ def _answer(metadata: Mapping[str, Any]) -> dict[str, Any]:
             "actions": {**actions, "description": "[action horizon, action dimension]; [B, …] of a batch"},
             "server_timing": timing,
             "policy_timing": timing,
+            "subtask": _TEXT,
+            "text": _TEXT,
             NOTES: {"type": "array", "items": note},
         },
     }
