@@ -204,6 +204,11 @@ def test_a_head_that_is_the_embedding_is_loaded_once(tmp_path: Path) -> None:
         kept = {name: one for name, one in (tensors | tied).items() if one is not None}
         save_file(kept, folder / "model.safetensors")
         assert open_checkpoint(folder).load_head("cpu", "f32") is None
+    save_file(tensors, folder / "model.safetensors")
+    before = open_checkpoint(folder).fingerprint()
+    tensors[HEAD][3, 3] += 1
+    save_file(tensors, folder / "model.safetensors")
+    assert open_checkpoint(folder).fingerprint() != before
     tensors[HEAD][3, 3] = np.nan
     save_file(tensors, folder / "model.safetensors")
     with pytest.raises(CheckpointError, match=r"lm_head\.weight are NaN"):

@@ -72,6 +72,7 @@ class TorchSource:
         heads: dict[str, Stored] = {}
         self.untied = False  # whether lm_head and the embedding are both stored
         self.head: Stored | None = None  # lm_head, where LeRobot has one beside the embedding
+        self.variant = "head" if getattr(self.names, "trains_head", False) else ""  # `Checkpoint.fingerprint` has it
         for stored in stored_tensors:
             key = current_name(stored.key.removeprefix(self._prefix))
             tied = key in (TIED_HEAD, TIED_EMBEDDING)

@@ -27,7 +27,7 @@ def refuse_memory(metadata: Mapping[str, Any], what: str) -> None:
         why = "has memory" if "memory" in metadata else "acts on subtasks"
         raise ConfigError(
             f"this policy {why}, and {what} doesn't keep a robot's history. `turbopi infer`, `serve`, `verify`, "
-            "`bench` and `inspect` take it, and so do UnifiedPolicy and the LeRobot plugin"
+            "`bench` and `inspect` take it, and so does UnifiedPolicy"
         )
 
 
