@@ -29,7 +29,8 @@ MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: th
 MAX_SEED = 2**64 - 1
 MAX_TEXT = 2000  # characters of a text that a message gives
 MAX_TOKENS = LIMITS["max_decoding_steps"]
-SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot")  # the last: for people
+# The last two are for people: the page and the log, and traces.
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot", "traceparent")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset", "seed", "observe", "subtask", "generate", "max_tokens"),

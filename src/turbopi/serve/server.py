@@ -59,6 +59,7 @@ from turbopi.serve.requests import (
     batch_row,
 )
 from turbopi.serve.signals import stop_signals
+from turbopi.serve.traces import Traces
 from turbopi.support.errors import ConfigError, DeviceLost
 
 logger = logging.getLogger(__name__)
@@ -128,6 +129,7 @@ class PolicyServer:
         )
         self.metrics.watch(lambda: self._calls.waiting, lambda: self._calls.running)
         self._live = Live(self.metrics, self._calls, lambda: self.lost) if options.has_page else None
+        self._traces: Traces | None = None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
         self._stopping = False
@@ -168,6 +170,8 @@ class PolicyServer:
         if self._started:
             raise RuntimeError("a PolicyServer starts once: make a new one")
         self._started = True
+        if self.options.traces:
+            self._traces = Traces(self._log)
         try:
             self.port = await self._listener.bind(self.host, self.port)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that can't be a name
@@ -198,6 +202,8 @@ class PolicyServer:
             self._calls.close()
             if self._recorder is not None:
                 self._recorder.close()
+            if self._traces is not None:
+                await self._traces.close()
             raise
 
     def _cannot_listen(self, error: Exception) -> ConfigError:
@@ -226,6 +232,8 @@ class PolicyServer:
         self._gate.flush_log()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
+        if self._traces is not None:
+            await self._traces.close()
 
     async def __aenter__(self) -> "PolicyServer":
         await self.start()
@@ -327,7 +335,7 @@ class PolicyServer:
         """Send a traceback and close, as openpi does."""
         self.metrics.error("policy")
         if self._live is not None:
-            self._live.refused(connection, "policy", text.strip().rpartition("\n")[2])  # what was raised
+            self._live.refused(connection, "policy", _raised(text))
         with contextlib.suppress(ConnectionClosed):
             await connection.send(text)
             await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
@@ -340,9 +348,14 @@ class PolicyServer:
         while not self._stopping:
             started = time.perf_counter()
             message, received, begun = await self._next(connection)
-            reply = begun if isinstance(begun, Refusal) else await self._requests.finish(begun)
+            try:
+                reply = begun if isinstance(begun, Refusal) else await self._requests.finish(begun)
+            except PolicyFailed as failure:
+                self._trace_refusal(connection, begun, Refusal("policy", _raised(str(failure))), received)
+                raise
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
+                self._trace_refusal(connection, begun, reply, received)
                 continue
             result, scheduling, notes = reply.result, reply.scheduling, reply.notes
             if reply.sent is None:
@@ -353,6 +366,9 @@ class PolicyServer:
                 await connection.drain()
                 finished = reply.sent
             self.metrics.request_seconds.observe(finished - received)
+            if self._traces is not None:
+                assert isinstance(begun, ClientRequest)
+                self._traces.answered(connection, begun, result, finished)
             if scheduling.firm:
                 self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
             for note in notes:
@@ -428,6 +444,11 @@ class PolicyServer:
             self._log.warning(f"{peer(connection)}: {reason}, the last one: {text}", "flood")
             await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
+    def _trace_refusal(self, connection: GuardedConnection, begun: Begun, refusal: Refusal, received: float) -> None:
+        if self._traces is not None:
+            request = begun if isinstance(begun, ClientRequest) else None
+            self._traces.refused(connection, request, refusal, received)
+
     def _record(self, message: bytes, result: dict[str, object], batch: int | None) -> None:
         """Record a call; of a batch message each row, as a call of its own."""
         assert self._recorder is not None
@@ -437,6 +458,11 @@ class PolicyServer:
             return
         for index in range(batch):
             self._recorder.put(batch_row(observation, index), batch_row(result, index), size=len(message) // batch)
+
+
+def _raised(text: str) -> str:
+    """What was raised, of a traceback."""
+    return text.strip().rpartition("\n")[2]
 
 
 def _set_aside_what_stays() -> None:
