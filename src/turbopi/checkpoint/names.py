@@ -90,10 +90,12 @@ class Names(Protocol):
 class PiNames:
     """Pi0's and Pi0.5's, openpi's and LeRobot's.
 
-    embedding  which of the tied two LeRobot computes with
+    embedding    which of the tied two LeRobot computes with
+    trains_head  LeRobot trains lm_head beside the embedding
     """
 
     embedding: str = TIED_EMBEDDING
+    trains_head: bool = False
 
     def canonical(self, key: str) -> str | None:
         key = current_name(key)
@@ -101,6 +103,12 @@ class PiNames:
 
     def native(self, name: str) -> str:
         return to_openpi(name)
+
+
+class TextNames(PiNames):
+    """LeRobot's pi052."""
+
+    trains_head = True
 
 
 class FastNames(PiNames):

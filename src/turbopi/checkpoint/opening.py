@@ -10,6 +10,7 @@ from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
 from turbopi.checkpoint.lerobot import LeRobotFolder, policy_type
 from turbopi.checkpoint.lerobot_fast import FastFolder
 from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder
+from turbopi.checkpoint.lerobot_text import TextFolder
 from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
@@ -172,13 +173,16 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
     return PeftSource(location.folder, weights, base.folder)
 
 
-_READERS: Mapping[Kind, type[LeRobotFolder]] = {  # by type of policy; others: LeRobotFolder
+_READERS: Mapping[Kind, type[LeRobotFolder]] = {  # of families whose weights have names of their own
     "smolvla": SmolVLAFolder,
     "pi0_fast": FastFolder,
 }
 
 
 def _lerobot_folder(location: Location) -> type[LeRobotFolder]:
+    """The reader of its type of policy."""
+    if policy_type(location.folder) == "pi052":
+        return TextFolder
     kind = _own_kind(location)
     return LeRobotFolder if kind is None else _READERS[kind]
 
@@ -197,7 +201,7 @@ def _kind(location: Location, source: WeightSource) -> Kind:
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
     untied, reader = getattr(source, "untied", False), _lerobot_folder(location)
-    detected = detect_kind(source, location.weights) if reader is LeRobotFolder else None  # or what they look like
+    detected = None if reader in _READERS.values() else detect_kind(source, location.weights)  # or what they look like
     for kind, other in _READERS.items():
         if other is not reader and (keys := settings.values.keys() & other.own_settings):
             raise ConfigError(f"{settings.source}: {min(keys)} only applies to {FAMILIES[kind].label}")

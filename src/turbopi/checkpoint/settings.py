@@ -27,6 +27,8 @@ itself.
     real_time             object of trained_max_delay (delays that training simulated, control steps),
                           execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime. The delay is
                           below the action horizon, the execution horizon at most as long
+    text                  object of template, with {prompt} in it, and max_tokens, 1 to 1000: the language head was
+                          trained to continue the template (Pi0.5 only). pi052 describes itself
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
@@ -55,7 +57,20 @@ from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
 from turbopi.checkpoint.target_time import UNUSED, TargetTime
-from turbopi.config import LIMITS, PRESETS, ImageResize, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
+from turbopi.config import (
+    LIMITS,
+    PRESETS,
+    WITH_TEXT,
+    ImageResize,
+    Kind,
+    Normalization,
+    NormMode,
+    PolicyConfig,
+    RealTime,
+    TextConfig,
+    TimeGrid,
+    memory_of,
+)
 from turbopi.models import family_of
 from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.support.errors import ConfigError
@@ -183,12 +198,22 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     for key in of_model.keys() - {one.name for one in fields(config.model)}:
         raise ConfigError(f"{settings.source}: {key} can't be chosen for {family_of(config.model).label}")
     config = config.with_model(**of_model)
+    if "text" in values:
+        _check_text(config, settings.source)
+        config = replace(config, text=values["text"])
     check_real_time(config, settings.source)
     if config.discrete_state_input and not (family := family_of(config.model)).state_in_prompt:
         raise ConfigError(
             f"{settings.source}: discrete_state_input is true, but {family.label} reads its state as a number token"
         )
     return config
+
+
+def _check_text(config: PolicyConfig, source: str) -> None:
+    if config.model.kind not in WITH_TEXT or memory_of(config.model) is not None:
+        raise ConfigError(f"{source}: text can't be chosen for {family_of(config.model).label}; it is for Pi0.5")
+    if config.text is not None:
+        raise ConfigError(f"{source}: text can't be chosen for LeRobot's pi052, whose config.json describes it")
 
 
 def check_real_time(config: PolicyConfig, source: str) -> None:
@@ -340,6 +365,12 @@ def _real_time(value: object) -> RealTime:
     return RealTime(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
 
 
+def _text_config(value: object) -> TextConfig:
+    options = _object(value)
+    _require(set(options) <= {"template", "max_tokens"} and isinstance(options.get("template"), str))
+    return TextConfig(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
+
+
 def _solver_grid(value: object) -> TimeGrid:
     if not isinstance(value, str | list):
         raise ValueError
@@ -394,6 +425,10 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
         "an object with trained_max_delay, execution_horizon (whole numbers of control steps), schedule (exponential, "
         "linear, ones or zeros) or max_guidance_weight (a number from 0)",
         _real_time,
+    ),
+    "text": (
+        "an object with template, a text with {prompt} in it, and perhaps max_tokens, a whole number from 1 to 1000",
+        _text_config,
     ),
     "vision_heads": _count(LIMITS["num_heads"]),
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),

@@ -31,12 +31,12 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
-    model, name = checkpoint.config.model, fitting.backend
+    model, name, writes = checkpoint.config.model, fitting.backend, checkpoint.config.writes_subtasks
     if name == "auto":
-        backends.qualified(device, precision, model, bar=sys.stderr.isatty())  # type: ignore[arg-type]
-        name = backends.choose(device, precision, model)[0]  # type: ignore[arg-type]
+        backends.qualified(device, precision, model, bar=sys.stderr.isatty(), writes=writes)  # type: ignore[arg-type]
+        name = backends.choose(device, precision, model, writes=writes)[0]  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
-    cls = backends.class_for(name, model)
+    cls = backends.class_for(name, model, writes=writes)
     requested = Denoising.of(checkpoint.config, *fitting.flow_arguments)
     no_pipeline: Any = None  # no observation is read
     own = requested.integration, requested.two_prompts

@@ -48,6 +48,10 @@ def checked_batch(size: int, error: Error) -> int:
     return _checked("the size of a batch", size, MAX_BATCH, error)
 
 
+def checked_tokens(tokens: int, most: int) -> int:
+    return _checked("max_tokens", tokens, most, ObservationError)
+
+
 def _checked(what: str, number: int, most: int, error: Error) -> int:
     whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     if not whole or not 1 <= number <= most:
@@ -89,6 +93,8 @@ class Denoising:
             return cls._of(config, steps, solver, time_grid)
         if not (family := family_of(config.model)).planned:
             raise ConfigError(f"guidance by a prompt's tag is for Pi0.5 and Pi0, not for {family.label}: leave it out")
+        if config.text is not None and config.text.subtasks is not None:
+            raise ConfigError("guidance by a prompt's tag isn't for policies that act on subtasks: leave it out")
         if tag is None:
             raise ConfigError(
                 f"guidance={shown(guidance)} was asked for, but nothing says what the policy was trained to follow: "

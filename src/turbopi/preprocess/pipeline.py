@@ -25,7 +25,8 @@ from turbopi.preprocess.robot_checks import (
     read_observation,
     width_of_outputs,
 )
-from turbopi.preprocess.tokenizer import PromptTokenizer
+from turbopi.preprocess.text_prompts import action_text
+from turbopi.preprocess.tokenizer import PromptTokenizer, Write
 from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.aloha import smolvla_actions, smolvla_state
 from turbopi.robots.base import Example, all_finite, keys_of, listed, read_prompt, read_state
@@ -47,6 +48,7 @@ class Incoming:
     images        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
     sent            of each camera, whether the observation has it
     valid           of each camera, whether the model sees an image of it
+    prompt_state    float64[s]  normalised, as prompts have it
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
@@ -63,6 +65,7 @@ class Incoming:
     sent: list[bool] = field(init=False)
     valid: list[bool] = field(init=False)
 
+    prompt_state: np.ndarray = field(init=False)
     state: np.ndarray = field(init=False)
     model_state: np.ndarray = field(init=False)
     tokens: np.ndarray = field(init=False)
@@ -122,8 +125,10 @@ class Pipeline:
         scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
         self._adds_raw_state = mask is not None and scaled_by_lerobot
         self._image_shape = (config.model.image_size,) * 2
-        write = family_of(config.model).prompt
-        self.write = None if write is None else functools.partial(write, config.model)
+        write, acts_on_subtasks = family_of(config.model).prompt, config.text is not None and config.text.subtasks
+        self.write: Write | None = action_text if acts_on_subtasks else None
+        if write is not None:
+            self.write = functools.partial(write, config.model)
         self._float_images = WAYS[config.image_resize].float_images
         self._black = np.zeros((*self._image_shape, 3), np.uint8) if config.missing_cameras == "black" else None
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
@@ -342,9 +347,8 @@ class Pipeline:
         return camera_image if self._float_images else to_uint8(camera_image, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
-        state = None
-        if self.config.discrete_state_input:
-            state = pad_last(sample.state, self.config.prompt_state_dim or 0)
+        sample.prompt_state = pad_last(sample.state, self.config.prompt_state_dim or 0)
+        state = sample.prompt_state if self.config.discrete_state_input else None
         sample.tokens, sample.token_mask = self._ids(sample.prompt, state, tagged=sample.guidance == 1)
         if sample.guidance not in (0, 1):
             ids, there = self._ids(sample.prompt, state, tagged=True)

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.models.observation import Observation, past_of
+from turbopi.models.observation import Observation, SeenObservation, past_of
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class PrefixLayout:
     positions: Tensor  # int64[B, S_padded]  RoPE positions: count of valid slots so far, minus 1
     columns: Tensor | None  # int64[S]  the slots that are computed
     mask: Tensor | None  # bool[B, S]  which of the computed slots are valid; None: all
+    causal: Tensor | None = None  # bool[B, S]  which of them no slot before them sees; None: all see each other
 
     @classmethod
     def of(cls, observation: Observation, tokens_per_image: int, *, compact: bool) -> "PrefixLayout":
@@ -30,11 +32,25 @@ class PrefixLayout:
         images = observation.image_mask.repeat_interleave(tokens_per_image, dim=1)
         pad_mask = torch.cat((images, *states, observation.token_mask), dim=1)
         positions = pad_mask.cumsum(1) - 1
+        causal = None
+        if isinstance(observation, SeenObservation) and observation.causal is not None:
+            causal = F.pad(observation.causal, (pad_mask.shape[1] - observation.causal.shape[1], 0))
         if not compact:
-            return cls(pad_mask, positions, None, pad_mask)
+            return cls(pad_mask, positions, None, pad_mask, causal)
         columns = pad_mask.any(0).nonzero().squeeze(1)
         mask = pad_mask[:, columns]
-        return cls(pad_mask, positions, columns, None if bool(mask.all()) else mask)
+        causal = None if causal is None else causal[:, columns]
+        return cls(pad_mask, positions, columns, None if bool(mask.all()) else mask, causal)
+
+    @property
+    def attended(self) -> Tensor | None:
+        """bool[B, 1, 1 or S, S]: the slots that a slot attends to; None: all."""
+        valid = None if self.mask is None else self.mask[:, None, None, :]
+        if self.causal is None:
+            return valid
+        block = self.causal.cumsum(1)  # a causal slot begins one; a slot sees its own and those before
+        seen = block[:, None, None, :] <= block[:, None, :, None]
+        return seen if valid is None else seen & valid
 
     @property
     def computed_positions(self) -> Tensor:

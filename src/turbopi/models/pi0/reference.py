@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from turbopi.config import FloatPrecision as FloatPrecision
 from turbopi.config import ModelConfig
-from turbopi.models.observation import Observation
+from turbopi.models.observation import Observation, SeenObservation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, has_two_prompts, of_rows
 from turbopi.models.pi0.denoise import run_expert, suffix_mask, suffix_rope, time_embedding
 from turbopi.models.pi0.exact import exact_float32
@@ -218,7 +218,8 @@ class Pi0Model(nn.Module):
         """
         per_image, layout = self.config.vision.num_tokens, self._layout(observation, compact=compact)
         cameras = camera_slots(observation, compact=compact)
-        image_embs, hidden = self.embed_cameras(observation, cameras)
+        seen = observation.seen if isinstance(observation, SeenObservation) else None
+        image_embs, hidden = self.embed_cameras(observation, cameras) if seen is None else seen
         if cameras is not None:  # back to their slots, from which the layout selects
             count = observation.image_mask.shape[1]
             slots = (cameras[:, None] * per_image + torch.arange(per_image, device=cameras.device)).flatten()
@@ -252,8 +253,7 @@ class Pi0Model(nn.Module):
     def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
         """Run the language model over embedded tokens and keep every layer's keys and values."""
         layout = embedded.layout
-        mask = None if layout.mask is None else layout.mask[:, None, None, :]
-        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, mask)
+        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, layout.attended)
         if trace is not None:
             trace["kv_k"] = layout.to_padded(k, 3).transpose(2, 3)
             trace["kv_v"] = layout.to_padded(v, 3).transpose(2, 3)
