@@ -99,6 +99,8 @@ def _noting(function: Callable[..., Any], begins: Sequence[list[float]], ends: S
 class NoTime:
     """A policy that takes no time, or sleeps for a model's."""
 
+    reads_in_place = True
+
     def __init__(self, work_s: float) -> None:
         self.metadata: dict[str, Any] = {"policy": "no time", "robot": "libero", "action_horizon": 10}
         self._work_s = work_s

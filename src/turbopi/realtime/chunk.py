@@ -61,7 +61,8 @@ def _checked_array(name: str, value: object, axes: str = "", rows: int | None = 
         or (axes and (array.ndim != 2 or rows not in (None, len(array))))
     ):
         raise ActionError(f'"{name}" isn\'t an array of numbers{" " + axes if axes else ""} but {_shape(value)}')
-    if array.dtype.kind == "f":
+    # A sum of squares that is small enough has no part that isn't: one pass. Most arrays end here.
+    if array.dtype.kind == "f" and not float(np.vdot(array, array)) <= _MOST:
         single = array.dtype.itemsize <= 4
         if not (np.isfinite(array).all() if single else np.abs(array).max() <= _MOST):  # the largest is NaN if one is
             places = np.argwhere(~np.isfinite(array) if single else ~(np.abs(array) <= _MOST))

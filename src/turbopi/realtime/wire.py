@@ -192,10 +192,14 @@ class Unpacker:
         self._size = -1
         self._like: _Alike | None = None
 
-    def unpack(self, data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
-        """What `unpack` returns or raises."""
+    def unpack(self, data: bytes | memoryview, *, max_bytes: int = MAX_BYTES) -> Any:
+        """What `unpack` returns or raises.
+
+        In a memoryview only images may change meanwhile: they are views of it, or of a copy.
+        """
         if self._like is not None and (value := self._like.filled(data)) is not None:
             return value
+        data = bytes(data)
         value, again = unpack(data, max_bytes=max_bytes), len(data) == self._size
         self._size, self._like = len(data), _Alike.of(data, value) if again else None  # not of what comes only once
         return value
@@ -469,7 +473,7 @@ class _Alike:
         assert end == len(data)
         return cls(data, skeleton, holes) if len(data) - sum(end - begin for begin, end, *_ in holes) < LARGE else None
 
-    def filled(self, data: bytes) -> dict[str, Any] | None:
+    def filled(self, data: bytes | memoryview) -> dict[str, Any] | None:
         """The value of `data`; None if it doesn't look like this message."""
         if len(data) != self._size or any(data[begin:end] != same for begin, end, same in self._same):
             return None
@@ -477,7 +481,7 @@ class _Alike:
         values = [
             _DOUBLE.unpack_from(data, begin)[0]
             if dtype is None
-            else np.ndarray(shape, dtype, whole[begin:end] if dtype.itemsize == 1 else data[begin:end])
+            else np.ndarray(shape, dtype, whole[begin:end] if dtype.itemsize == 1 else bytes(data[begin:end]))
             for begin, end, dtype, shape in self._holes
         ]
         return _filled(self._value, values)

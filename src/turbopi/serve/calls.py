@@ -44,6 +44,9 @@ class Policy(Protocol):
     With "memory" in its metadata it has `new_history()` and `observe(obs, history=…)`, its `infer` takes `history`, and
     requests run one by one.
 
+    With a true `reads_in_place` it is done with an observation's images when it returns: the client may write the next
+    ones over them.
+
     With a true `gives_readings`, all three are given `readings=True`, and their results hold a
     `turbopi.policy.readings.Reading` of the call under "reading", of which the server makes notes.
     """
@@ -201,8 +204,9 @@ class PolicyCalls:
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
         request.call = _Call([observation], arguments, request.answer)
-        request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
-        request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
+        if arguments:
+            request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
+            request.alone = request.alone or not self._may_share(arguments)
         results = self.worker.submit(request)
         if self._pipelined and not arguments:
             results.add_done_callback(self._record_seconds)

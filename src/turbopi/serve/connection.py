@@ -50,6 +50,7 @@ class Shared:
     memory: MemoryBudget = field(init=False)
     pool: WorkPool = field(init=False)
     slots: int = field(default=0, init=False)  # clients with shared memory
+    in_place: bool = False  # the policy reads images where the client wrote them
     spare: SpareBuffer = field(default_factory=SpareBuffer, init=False)
     # One for all connections: what one read brought is handled before the next read.
     scratch: memoryview = field(default_factory=lambda: memoryview(bytearray(READ_BYTES)), init=False)
@@ -91,6 +92,9 @@ def frame_head(data: bytes | memoryview, at: int) -> FrameHead | None:
     return FrameHead(size, length, first & 0x0F, bool(first & 0x80), is_zero_copy(first, second, length))
 
 
+Take = Callable[["bytes | memoryview"], "asyncio.Future[Any] | None"]  # see `GuardedConnection.recv_taken`
+
+
 @dataclass
 class _Message:
     """What a message has cost so far."""
@@ -125,8 +129,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._handed_over = 0  # bytes of messages
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._writing = threading.RLock()  # for the socket; other threads write to it in `send_at_once` alone
-        self._take: Callable[[bytes], asyncio.Future[Any] | None] | None = None
-        self._waiter: asyncio.Future[bytes | None] | None = None
+        self._take: Take | None = None
+        self._waiter: asyncio.Future[bytes | memoryview | None] | None = None
         self._slots: SharedSlots | None = None
         self._unsent: bytes | memoryview = b""  # what the socket didn't take there
         self._descriptor: int | None = None
@@ -182,7 +186,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         near, far = (self.transport.get_extra_info(name) for name in ("sockname", "peername"))
         return bool(near and far) and near[0] == far[0]
 
-    async def recv_taken(self, take: "Callable[[bytes], asyncio.Future[Any] | None]") -> str | bytes:
+    async def recv_taken(self, take: "Take") -> str | bytes | memoryview:
         """`recv`, but `take` has the message at once, in the callback that received it, if it comes in one frame.
 
         If it returns a Future, this returns the message when that is done: nothing is done for it before. It may not
@@ -199,7 +203,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                 return message
         return await self.recv()
 
-    def _wake(self, message: bytes | None) -> None:
+    def _wake(self, message: bytes | memoryview | None) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(message)
 
@@ -332,13 +336,15 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         if self._take is not None and isinstance(event, Frame) and event.opcode < Opcode.CLOSE:
             take, self._take = self._take, None
             if event.opcode is Opcode.BINARY and event.fin and len(event.data) < MAX_BYTES:
-                message = bytes(event.data)
+                message = event.data if type(event.data) is memoryview else bytes(event.data)
                 if (until := take(message)) is None:
                     self._wake(message)
                 else:
                     until.add_done_callback(lambda _: self._wake(message))
                 return
             self._wake(None)
+        if isinstance(event, Frame) and type(event.data) is memoryview:
+            event = Frame(Opcode.BINARY, bytes(event.data))
         super().process_event(event)
 
     def _from_slot(self, frame: Frame, slots: SharedSlots) -> Frame:
@@ -349,7 +355,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         work = len(message) / BYTES_OF_ONE_WORK
         self._credit.spend(work)
         self._unanswered[-1].work += work
-        return Frame(Opcode.BINARY, message)
+        return Frame(Opcode.BINARY, message if self._shared.in_place else bytes(message))
 
     # --- what comes in ------------------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
 from turbopi.realtime.wire import Unpacker, WireError, unpack
-from turbopi.serve.connection import DISCARD_PAUSE_SECONDS, GuardedConnection, Owner, Shared
+from turbopi.serve.connection import DISCARD_PAUSE_SECONDS, GuardedConnection, Owner, Shared, Take
 from turbopi.serve.json_messages import from_json, to_json
 from turbopi.serve.limited_log import peer
 from turbopi.serve.limits import Credit
@@ -119,8 +119,8 @@ class PortConnection(GuardedConnection):
         if self._post is None:
             super().offer_memory(request, response)
 
-    async def recv_taken(self, take: Callable[[bytes], "asyncio.Future[Any] | None"]) -> str | bytes:
-        received: str | bytes = await (super().recv_taken(take) if self._post is None else self.recv())
+    async def recv_taken(self, take: Take) -> str | bytes | memoryview:
+        received: str | bytes | memoryview = await (super().recv_taken(take) if self._post is None else self.recv())
         return received
 
     def send_at_once(self, message: bytes) -> bool:

@@ -30,6 +30,7 @@ from turbopi.realtime.messages import (
     Note,
     as_name,
     as_number,
+    is_plain,
     notes_in,
 )
 from turbopi.realtime.wire import Unpacker, WireError, pack
@@ -222,10 +223,11 @@ class RequestHandler:
         self._calls, self._real_time, self._metrics, self._options = calls, real_time, metrics, options
         self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
         self._histories = histories
+        self._usual = read_scheduling({}, options.deadline_ms)
         self._watches: OrderedDict[str, Watch] = OrderedDict()  # of named sessions, the last used one at the end
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
-    async def take(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+    async def take(self, connection: GuardedConnection, message: str | bytes | memoryview, arrived: float) -> "Begun":
         """`begin`, of a message of any size."""
         if len(message) < LARGE:
             return self.begin(connection, message, arrived)
@@ -235,7 +237,7 @@ class RequestHandler:
         connection.took(time.perf_counter() - started)
         return self._begin(connection, decoded.result, arrived)
 
-    def begin(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+    def begin(self, connection: GuardedConnection, message: str | bytes | memoryview, arrived: float) -> "Begun":
         """Submit the request that a message holds, without waiting. For its results call `finish`, or `drop`."""
         return self._begin(connection, partial(self._decode, connection, message), arrived)
 
@@ -267,7 +269,7 @@ class RequestHandler:
         """End the decoding thread. It isn't waited for."""
         self._decoder.shutdown(wait=False)
 
-    def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
+    def _decode(self, connection: GuardedConnection, message: str | bytes | memoryview) -> dict[str, Any]:
         """The message as a map. Raises WireError."""
         started = time.perf_counter()
         try:
@@ -277,8 +279,10 @@ class RequestHandler:
 
     def read(self, received: Mapping[str, Any], connection: GuardedConnection, arrived: float) -> ClientRequest:
         """Raises ObservationError for keys and values that can't be right."""
-        scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
-        connection.robot = read_robot(received) or connection.robot
+        scheduling = self._usual
+        if not is_plain(received):
+            scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
+            connection.robot = read_robot(received) or connection.robot
         if scheduling.batch is None:
             plan = self._real_time.plan(received, connection)
             connection.robot = connection.robot or plan.name or connection.posted
@@ -425,14 +429,14 @@ class RequestHandler:
         return {**stacked, NOTES: noted[:MOST_NOTES]} if noted else stacked
 
 
-def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
+def decode(message: str | bytes | memoryview, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
     """The map that a message holds. Raises WireError."""
     if isinstance(message, str):
         raise WireError("a request is a binary frame with a msgpack map, not a text frame")
     observation = unpacker.unpack(message, max_bytes=max_bytes)
     if not isinstance(observation, dict):
         raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
-    if not all(isinstance(key, str) for key in observation):
+    if not all([type(key) is str for key in observation]):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
 

@@ -99,7 +99,9 @@ class PolicyServer:
         hosts = AllowedHosts(options.host, options.allowed_hosts)
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
         self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
-        self._listener = Listener(self._gate, self._handle, Shared(self._limits, self.metrics, self._log))
+        in_place = calls is None and options.record_dir is None and getattr(policy, "reads_in_place", False)
+        shared = Shared(self._limits, self.metrics, self._log, in_place=in_place)
+        self._listener = Listener(self._gate, self._handle, shared)
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
         self._calls: Calls = (
@@ -362,7 +364,7 @@ class PolicyServer:
                 connection.answered("good")
                 continue
             if self._live is not None:
-                assert isinstance(message, bytes)
+                assert not isinstance(message, str)
                 self._live.answered(connection, message, reply, finished - received)
             if self._recorder is not None:
                 assert isinstance(message, bytes)
@@ -371,14 +373,14 @@ class PolicyServer:
             connection.answered("good")
         await self._say_goodbye(connection)
 
-    async def _next(self, connection: GuardedConnection) -> tuple[str | bytes, float, Begun]:
+    async def _next(self, connection: GuardedConnection) -> tuple[str | bytes | memoryview, float, Begun]:
         """The next message, when it came, and its request, which is submitted by the callback that receives it.
 
         Raises ClientLeft if the client leaves meanwhile.
         """
         begun: list[tuple[float, Begun | Exception]] = []
 
-        def begin(message: bytes) -> "asyncio.Future[Any] | None":
+        def begin(message: bytes | memoryview) -> "asyncio.Future[Any] | None":
             self._idle.discard(connection)
             received = time.perf_counter()
             try:

@@ -129,6 +129,11 @@ class _Recent:
         self._last.move_to_end(source)
         self._drop(now)
 
+    def others(self, now: float, source: Hashable) -> bool:
+        """Whether any but this source did."""
+        self._drop(now)
+        return len(self._last) > (source in self._last)
+
     def values(self, now: float) -> dict[Hashable, float]:
         self._drop(now)
         return {source: value for source, (_, value) in self._last.items()}
@@ -222,13 +227,14 @@ class Schedule:
         """
         if self._running or self._waiting or request.firm or request.continued:
             return False
-        if not request.alone and self._times((request,)).formed_largest(now) > request.rows:
-            own = {request.source}
-            if self._active.values(now).keys() - own or self._think_times.expected(now, ACTIVE_SECONDS, own):
+        times, turns = (self._joining,) * 2 if request.joins else (self.times, self._turns)
+        if not request.alone and times.formed_largest(now) > request.rows:
+            own = (request.source,)
+            if self._active.others(now, request.source) or self._think_times.expected(now, ACTIVE_SECONDS, own):
                 return False
         request.queued = now
         self._running, self._exhausted_last = (request,), False
-        self._until = now + self._turn_seconds((request,), now)
+        self._until = now + turns.total(request.rows, now)
         return True
 
     def remove(self, request: Request) -> None:
