@@ -6,9 +6,9 @@ deadline: a server that has stopped reading holds `send` for ever, and a name's 
 is made on a thread of its own, and at the deadline of an exchange the socket is shut down, which ends whatever waits on
 it. The thread that does so also answers the server's pings, and its goodbye, while nobody calls.
 
-A thread that sleeps takes 50 to 100 us to wake up. So with a server on the same host the caller is awake a little before
-the answer is due by the last ones, and looks for it without a pause: for AWAKE_S at most, and only where there are
-processors enough.
+A thread that sleeps takes 50 to 100 us to wake up. So with a server on the same host the caller is awake a little
+before the answer is due by the last ones, and looks for it without a pause: for AWAKE_S at most, and only where there
+are processors enough.
 """
 
 import contextlib
@@ -30,6 +30,7 @@ from websockets.http11 import USER_AGENT, Response
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from turbopi.realtime.frames import binary_frame, binary_message, head_bytes
 from turbopi.realtime.shared_memory import HEADER, WANTED, Parts, SharedWriter, writer
 from turbopi.realtime.wire import MAX_BYTES
 
@@ -142,7 +143,7 @@ class _Stream:
     def ring(self, bell: bytes) -> None:
         """`send`, to this host, where nothing stands between that a mask would protect: it is zero."""
         self._check_open()
-        self.socket.sendall(bytes((0x80 | Opcode.BINARY, 0x80 | len(bell))) + bytes(4) + bell)
+        self.socket.sendall(binary_frame(bell, masked=True))
 
     def _check_open(self) -> None:
         if self._protocol.state is not State.OPEN:
@@ -191,15 +192,16 @@ class _Stream:
     def _read(self) -> None:
         connecting = self._protocol.state is State.CONNECTING
         data = self.socket.recv(1 if connecting else READ_BYTES)  # so that frames begin with a read
-        if not self._begun and (answer := _whole_binary(data)) is not None and self._protocol.state is State.OPEN:
-            self._events.append(Frame(Opcode.BINARY, answer))  # nearly always; the library would take 30 us
+        if not self._begun and self._protocol.state is State.OPEN and (answer := binary_message(data)) is not None:
+            self._events.append(Frame(Opcode.BINARY, answer))  # nearly always
             return
         if data:
             self._protocol.receive_data(data)
         else:
             self._protocol.receive_eof()
         events = self._protocol.events_received()
-        self._begun = 0 if connecting else self._begun + len(data) - sum(map(_frame_bytes, events))
+        frames = [len(event.data) for event in events if isinstance(event, Frame)]
+        self._begun = 0 if connecting else self._begun + len(data) - sum(frames) - sum(map(head_bytes, frames))
         self._events.extend(events)
         self._flush()
 
@@ -210,21 +212,6 @@ class _Stream:
             else:  # no more will follow
                 with contextlib.suppress(OSError):
                     self.socket.shutdown(socket.SHUT_WR)
-
-
-def _whole_binary(data: bytes) -> bytes | None:
-    """The payload, if these are one binary frame of a server that is a message of its own."""
-    if len(data) < 2 or data[0] != 0x80 | Opcode.BINARY or data[1] > 127:
-        return None
-    begin = 2 if data[1] < 126 else 4 if data[1] == 126 else 10
-    length = data[1] if begin == 2 else int.from_bytes(data[2:begin], "big")
-    return data[begin:] if len(data) == begin + length else None
-
-
-def _frame_bytes(event: object) -> int:
-    """Of a frame of the server, which the library made an event of."""
-    length = len(event.data) if isinstance(event, Frame) else 0
-    return length + (2 if length < 126 else 4 if length < 2**16 else 10)
 
 
 class _Awake:

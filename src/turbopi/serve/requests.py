@@ -436,7 +436,7 @@ def decode(message: str | bytes | memoryview, max_bytes: int, unpacker: Unpacker
     observation = unpacker.unpack(message, max_bytes=max_bytes)
     if not isinstance(observation, dict):
         raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
-    if not all([type(key) is str for key in observation]):
+    if not {str}.issuperset(map(type, observation)):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
 
