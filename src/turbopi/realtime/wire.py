@@ -475,8 +475,11 @@ class _Alike:
 
     def filled(self, data: bytes | memoryview) -> dict[str, Any] | None:
         """The value of `data`; None if it doesn't look like this message."""
-        if len(data) != self._size or any(data[begin:end] != same for begin, end, same in self._same):
+        if len(data) != self._size:
             return None
+        for begin, end, same in self._same:
+            if data[begin:end] != same:
+                return None
         whole = memoryview(data)
         values = [
             _DOUBLE.unpack_from(data, begin)[0]

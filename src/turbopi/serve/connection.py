@@ -382,7 +382,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         elif self.paused:
             blocked = True  # it doesn't read what it is sent: what it sends would only lead to more
         else:
-            self._cancel("retry")
+            if self._timers:
+                self._cancel("retry")
             self._credit.refill()
             blocked = self._scan()
         self._set_reading(not blocked)
@@ -405,7 +406,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                     break
                 self._payload_left = head.length
                 if begins and head.zero_copy and head.length <= self._limits.message_bytes:
-                    self._hand_over(data[begun:at])
+                    if at > begun:
+                        self._hand_over(data[begun:at])
                     begun = at + head.size
                     mask, end = bytes(data[begun - 4 : begun]), begun + head.length
                     if end <= len(data):  # it is here as a whole

@@ -9,7 +9,6 @@ docs/dev/request.md follows one observation all the way; docs/serving_sessions.m
 """
 
 import asyncio
-import contextlib
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -364,9 +363,12 @@ class RequestHandler:
     def _answer_at_once(self, request: ClientRequest, result: Result) -> None:
         """Send the reply from the policy's thread, if that can be done now."""
         request.reply = reply = self._reply(request, [result])
-        with contextlib.suppress(WireError):  # the event loop's thread says so
-            if request.connection.send_at_once(pack(reply.result)):
-                request.reply = reply._replace(sent=time.perf_counter())
+        try:
+            packed = pack(reply.result)
+        except WireError:  # the event loop's thread says so
+            return
+        if request.connection.send_at_once(packed):
+            request.reply = reply._replace(sent=time.perf_counter())
 
     def _note(self, request: ClientRequest, results: Sequence[Result]) -> list[Note]:
         """Put notes in place of the readings of a request's answers. Returns those that the log hasn't said yet."""
@@ -415,8 +417,8 @@ class RequestHandler:
         """The map to send, of results that all have actions; with "server_timing"."""
         answers = [result.answer for result in results if result.answer is not None]
         runs = list({result.run: result for result in results}.values())
-        server_timing: dict[str, float] = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
-        if (largest := max(run.batch for run in runs)) > 1:
+        server_timing: dict[str, float] = {"infer_ms": sum([run.seconds for run in runs]) * 1e3}
+        if (largest := max([run.batch for run in runs])) > 1:
             server_timing["batch"] = largest
         if request.connection.cycle_s is not None:
             server_timing["prev_total_ms"] = request.connection.cycle_s * 1e3

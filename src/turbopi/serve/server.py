@@ -97,6 +97,8 @@ class PolicyServer:
         self._limits = limits_for(options.max_message_mb, options.max_clients, limits)
         self._log = LimitedLog(logger)
         hosts = AllowedHosts(options.host, options.allowed_hosts)
+        # Why no request can be served any more: the device failed for good. None as long as it works.
+        self.lost: str | None = None
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
         self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
         in_place = calls is None and options.record_dir is None and getattr(policy, "reads_in_place", False)
@@ -115,7 +117,7 @@ class PolicyServer:
                     "this policy has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
                 )
             self._histories = Histories(policy.new_history, policy.metadata["memory"]["bytes"])  # type: ignore[attr-defined]
-        self._lost: Future[str] = Future()  # set from the worker's thread
+        self._lost: Future[None] = Future()  # done when `lost` is there: from the worker's thread
         self._requests = RequestHandler(
             self._calls,
             self._real_time,
@@ -140,15 +142,11 @@ class PolicyServer:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"ws://{host}:{self.port}"
 
-    @property
-    def lost(self) -> str | None:
-        """Why no request can be served any more: the device failed for good. None as long as it works."""
-        return self._lost.result() if self._lost.done() else None
-
     def _lose(self, reason: str) -> None:
-        if not self._lost.done():
+        if self.lost is None:
             logger.error("the device is lost, and every request is refused from here on: %s", reason)
-            self._lost.set_result(reason)
+            self.lost = reason
+            self._lost.set_result(None)
 
     @property
     def recording(self) -> Path | None:

@@ -259,7 +259,9 @@ class Schedule:
         """
         if seconds is not None:
             rows = sum(request.rows for request in self._running)
-            self._turn_times(self._running).ran(rows, seconds, now)
+            times = self._turn_times(self._running)
+            times.ran(rows, seconds, now)
+            times.seconds(1, now)  # it is kept until the next request comes, which then needn't wait for it
         for request in self._running:
             if not request.later:
                 self._think_times.answered(request.source, now)
