@@ -186,7 +186,7 @@ class ClientRequest:
             deadline=queued + scheduling.deadline,
             firm=scheduling.firm,
             priority=scheduling.priority,
-            source=connection.id,
+            source=connection.id.int,  # a UUID is hashed by Python
             slowed=connection.slowed,
             session=self.plan.name,
             rows=rows,
@@ -361,7 +361,9 @@ class RequestHandler:
         return Reply(self._answer(request, results), request.scheduling, noted, state)
 
     def _answer_at_once(self, request: ClientRequest, result: Result) -> None:
-        """Send the reply from the policy's thread, if that can be done now."""
+        """Send the reply, if there is one and that can be done now: not by the task of its connection, but sooner."""
+        if request.reply is not None or result.error is not None:
+            return
         request.reply = reply = self._reply(request, [result])
         try:
             packed = pack(reply.result)

@@ -24,6 +24,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ from turbopi.serve.requests import (
     ClientRequest,
     PolicyFailed,
     Refusal,
+    Reply,
     RequestHandler,
     batch_row,
 )
@@ -66,6 +68,9 @@ LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /health
 # Seconds after which a thread that computes lets another one go on that waits to. Python's 5 ms are long for answers
 # that wait while the policy's thread reads a batch, and for that thread while the event loop reads what comes.
 SWITCH_SECONDS = 0.0005
+# After an answer, until it is counted, shown and recorded. By then a client that goes on at once has its next turn, and
+# so has a batch of them: it needn't wait for that.
+COUNT_SECONDS = 0.005
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
 
@@ -132,6 +137,7 @@ class PolicyServer:
         self._live = Live(self.metrics, self._calls, lambda: self.lost) if options.has_page else None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
+        self._uncounted: list[Callable[[], None]] = []
         self._stopping = False
         self._greeting = b""
 
@@ -285,6 +291,7 @@ class PolicyServer:
         """One client, from its metadata to its close; or one who watches."""
         if self._live is not None:
             if is_feed(connection.request):
+                self._count()  # all that was answered is there in the first frame
                 self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
             self._live.connected(connection)
@@ -309,6 +316,7 @@ class PolicyServer:
             logger.exception("%s: the server failed", peer(connection))
             await self._fail(connection, traceback.format_exc())
         finally:
+            self._count()
             self._idle.discard(connection)
             self._real_time.closed(connection)
             if self._histories is not None:
@@ -323,6 +331,7 @@ class PolicyServer:
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
+        self._count()  # in the order in which it happened
         self.metrics.error("policy")
         if self._live is not None:
             self._live.refused(connection, "policy", text.strip().rpartition("\n")[2])  # what was raised
@@ -342,34 +351,67 @@ class PolicyServer:
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
                 continue
-            result, scheduling, notes = reply.result, reply.scheduling, reply.notes
             if reply.sent is None:
-                await connection.send(pack(result))
+                await connection.send(pack(reply.result))
                 finished = time.perf_counter()
-                await asyncio.sleep(0)  # the other clients of the batch get their answers before what follows
             else:
                 await connection.drain()
                 finished = reply.sent
-            self.metrics.request_seconds.observe(finished - received)
-            if scheduling.firm:
-                self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
-            for note in notes:
-                self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
-                if self._live is not None:
-                    self._live.noted(connection, note.kind, note.text)
             connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
-            if "actions" not in result:  # a policy with memory has recorded the observation alone
-                connection.answered("good")
-                continue
-            if self._live is not None:
-                assert not isinstance(message, str)
-                self._live.answered(connection, message, reply, finished - received)
-            if self._recorder is not None:
-                assert isinstance(message, bytes)
-                self._record(message, result, scheduling.batch)
-            del message, begun, reply, result  # a connection that waits must not hold them in memory
+            assert not isinstance(message, str)
+            self._count_later(connection, message, reply, received, finished)
+            del message, begun, reply  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
+
+    def _count_later(
+        self,
+        connection: GuardedConnection,
+        message: bytes | memoryview,
+        reply: Reply,
+        received: float,
+        finished: float,
+    ) -> None:
+        """Count an answer after COUNT_SECONDS, or now if its message takes much memory."""
+        if self._live is not None and self._live.watched:
+            message = bytes(message)  # now: what comes next may be written over it
+        self._uncounted.append(partial(self._count_answer, connection, message, reply, received, finished))
+        if len(message) > self._limits.free_bytes:
+            self._count()
+        elif len(self._uncounted) == 1:
+            asyncio.get_running_loop().call_later(COUNT_SECONDS, self._count)
+
+    def _count(self) -> None:
+        """Count all answers that aren't counted yet."""
+        uncounted, self._uncounted = self._uncounted, []
+        for count in uncounted:
+            try:
+                count()
+            except Exception:  # a fault of this server must cost no client
+                logger.exception("an answer wasn't counted, shown or recorded")
+
+    def _count_answer(
+        self,
+        connection: GuardedConnection,
+        message: bytes | memoryview,
+        reply: Reply,
+        received: float,
+        finished: float,
+    ) -> None:
+        scheduling = reply.scheduling
+        self.metrics.request_seconds.observe(finished - received)
+        if scheduling.firm:
+            self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
+        for note in reply.notes:
+            self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
+            if self._live is not None:
+                self._live.noted(connection, note.kind, note.text)
+        if "actions" not in reply.result:  # a policy with memory has recorded the observation alone
+            return
+        if self._live is not None:
+            self._live.answered(connection, message, reply, finished - received)
+        if self._recorder is not None:
+            self._record(bytes(message), reply.result, scheduling.batch)
 
     async def _next(self, connection: GuardedConnection) -> tuple[str | bytes | memoryview, float, Begun]:
         """The next message, when it came, and its request, which is submitted by the callback that receives it.
@@ -414,6 +456,7 @@ class PolicyServer:
         """Send the refusal; close with 1008 after many bad requests in a row: such a client doesn't read answers."""
         kind, text = refusal
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+        self._count()  # in the order in which it happened
         self.metrics.error(kind)
         self._log.warning(f"{peer(connection)}: {text}", kind)
         if self._live is not None:

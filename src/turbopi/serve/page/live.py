@@ -201,6 +201,11 @@ class Live:
             self._pending.add(task)
             task.add_done_callback(self._pending.discard)
 
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at the page."""
+        return bool(self._watchers)
+
     def noted(self, connection: GuardedConnection, kind: str, text: str) -> None:
         """The log has a note on a robot's call."""
         self._troubles.append(Trouble(time.time(), kind, f"{self._known_by_name(connection).title}: {clean(text)}"))
