@@ -4,20 +4,13 @@ _BINARY = 0x82  # a message in one frame
 _MASKED = 0x80
 
 
-def head_bytes(length: int) -> int:
-    """Of a frame with so many bytes of payload, without its mask."""
-    return 2 if length < 126 else 4 if length < 2**16 else 10
-
-
-def binary_frame(message: bytes, masked: bool = False) -> bytes:
-    """The frame of a message. masked: of a client's, with a mask of zeros, which changes nothing."""
-    length, mask = len(message), _MASKED if masked else 0
-    more = head_bytes(length) - 2
-    if more:
-        head = bytes((_BINARY, mask | (126 if more == 2 else 127))) + length.to_bytes(more, "big")
-    else:
-        head = bytes((_BINARY, mask | length))
-    return b"".join((head, bytes(4) if masked else b"", message))
+def binary_head(length: int, *, masked: bool = False) -> bytes:
+    """What is in front of a message of that length. masked: of a client's, with a mask of zeros: it changes nothing."""
+    mask, zeros = (_MASKED, bytes(4)) if masked else (0, b"")
+    if length < 126:
+        return bytes((_BINARY, mask | length)) + zeros
+    size = 2 if length < 2**16 else 8
+    return bytes((_BINARY, mask | (126 if size == 2 else 127))) + length.to_bytes(size, "big") + zeros
 
 
 def binary_message(data: bytes) -> bytes | None:

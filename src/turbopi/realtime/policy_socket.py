@@ -30,7 +30,7 @@ from websockets.http11 import USER_AGENT, Response
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
-from turbopi.realtime.frames import binary_frame, binary_message, head_bytes
+from turbopi.realtime.frames import binary_head, binary_message
 from turbopi.realtime.shared_memory import HEADER, WANTED, Parts, SharedWriter, writer
 from turbopi.realtime.wire import MAX_BYTES
 
@@ -143,7 +143,7 @@ class _Stream:
     def ring(self, bell: bytes) -> None:
         """`send`, to this host, where nothing stands between that a mask would protect: it is zero."""
         self._check_open()
-        self.socket.sendall(binary_frame(bell, masked=True))
+        self.socket.sendall(binary_head(len(bell), masked=True) + bell)
 
     def _check_open(self) -> None:
         if self._protocol.state is not State.OPEN:
@@ -201,7 +201,8 @@ class _Stream:
             self._protocol.receive_eof()
         events = self._protocol.events_received()
         frames = [len(event.data) for event in events if isinstance(event, Frame)]
-        self._begun = 0 if connecting else self._begun + len(data) - sum(frames) - sum(map(head_bytes, frames))
+        whole = sum(len(binary_head(length)) + length for length in frames)
+        self._begun = 0 if connecting else self._begun + len(data) - whole
         self._events.extend(events)
         self._flush()
 

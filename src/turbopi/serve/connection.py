@@ -23,7 +23,7 @@ from websockets.protocol import Event, State
 from websockets.server import ServerProtocol
 
 from turbopi.policy.watch import Watch
-from turbopi.realtime.frames import binary_frame
+from turbopi.realtime.frames import binary_head
 from turbopi.realtime.shared_memory import HEADER, WANTED, SharedSlots
 from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
@@ -213,7 +213,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
         The caller sees to it that nothing else is sent on this connection meanwhile, but for what the library sends.
         """
-        frame = binary_frame(message)
+        frame = binary_head(len(message)) + message
         with self._writing:  # without the lock the descriptor might be another connection's by now
             if self._descriptor is None or self.protocol.state is not State.OPEN or self.transport.is_closing():
                 return False

@@ -64,7 +64,7 @@ class Request:
     alone     never in a batch with others
     joins     it joins a chunk or requests model_actions: runs with such a request have a table T(B) of their own
     call      what to run; not read here
-    answer    sends its result at once, from the policy's thread; not read here
+    answer    sends its result at once, from any thread; not read here
     """
 
     arrived: float
