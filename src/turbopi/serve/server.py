@@ -355,7 +355,8 @@ class PolicyServer:
                 await connection.send(pack(reply.result))
                 finished = time.perf_counter()
             else:
-                await connection.drain()
+                with contextlib.suppress(OSError):  # its client has left, which the next message says
+                    await connection.drain()
                 finished = reply.sent
             connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
             assert not isinstance(message, str)
