@@ -12,7 +12,6 @@ are processors enough.
 """
 
 import contextlib
-import os
 import select
 import selectors
 import socket
@@ -33,6 +32,7 @@ from websockets.uri import parse_uri
 from turbopi.realtime.frames import binary_head, binary_message
 from turbopi.realtime.shared_memory import HEADER, WANTED, Parts, SharedWriter, writer
 from turbopi.realtime.wire import MAX_BYTES
+from turbopi.support.processors import usable_processors
 
 CLOSE_S = 1.0  # for the goodbye: a server that hangs says none
 IDLE_S = 0.25  # after a call, from which on somebody else reads the socket
@@ -57,7 +57,7 @@ class PolicySocket:
         self._stream = _connected(url, api_key, seconds)
         self.socket = self._stream.socket
         self._memory: SharedWriter | None = writer(self._stream.offer)
-        spares = self._memory is not None and processors() >= PROCESSORS
+        spares = self._memory is not None and usable_processors() >= PROCESSORS
         self._awake = _Awake(self.socket) if spares else contextlib.nullcontext()
         self._cutter = _Cutter(self._stream)
         self.greeting = self._exchange(None, deadline, seconds)
@@ -235,11 +235,6 @@ class _Awake:
 
     def __exit__(self, *_: object) -> None:
         self._took.append(time.monotonic() - self._began)
-
-
-def processors() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Cutter:

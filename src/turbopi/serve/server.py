@@ -222,6 +222,7 @@ class PolicyServer:
         await self._calls.drain()
         await self._listener.ended(self._limits.close_seconds)
         await asyncio.gather(*goodbyes)
+        self._count()
         self._calls.close()
         if self._live is not None:
             await self._live.close()
