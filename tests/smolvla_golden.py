@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+from safetensors.numpy import save_file
 
 COMMIT = "0" * 40
 GOLDEN = Path(__file__).parent / "golden_smolvla"
@@ -31,6 +32,18 @@ def make_checkpoint(name: str, folder: Path, golden: Path = GOLDEN) -> Path:
     if (packed := golden / name / "model.safetensors.xz").is_file():
         (folder / "model.safetensors").write_bytes(lzma.decompress(packed.read_bytes()))
     return folder
+
+
+def make_aloha(folder: Path) -> tuple[Path, dict[str, np.ndarray]]:
+    """special_tokens with another config.json and statistics, and what tools/lerobot_cases/smolvla_aloha.py kept."""
+    kept = dict(np.load(GOLDEN / "special_tokens/aloha.npz"))
+    make_checkpoint("special_tokens", folder)
+    config = json.loads((folder / "config.json").read_text()) | json.loads(str(kept["changes"]))
+    (folder / "config.json").write_text(json.dumps(config))
+    stats = {key.replace("/", "."): one for key, one in kept.items() if key.endswith(("/mean", "/std"))}
+    for file in folder.glob("policy_*.safetensors"):
+        save_file(stats, file)
+    return folder, kept
 
 
 class GoldenRuns:

@@ -66,6 +66,11 @@ def test_a_hub_name_is_recognised() -> None:
 def test_paths_that_hold_no_checkpoint_say_what_is_there(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"there is no folder .*/nowhere$"):
         open_checkpoint(tmp_path / "nowhere")
+    with pytest.raises(
+        CheckpointError, match=r"/small_policy; the one that comes with Turbo-Pi is (.*/small_policy)$"
+    ) as no:
+        open_checkpoint(tmp_path / "small_policy")
+    assert open_checkpoint(str(no.value).rpartition(" is ")[2]).config.robot == "libero"
     with pytest.raises(CheckpointError, match=r"holds no checkpoint: expected model.safetensors .* but it has nothing"):
         open_checkpoint(tmp_path)
     (tmp_path / "notes.txt").touch()

@@ -24,6 +24,10 @@ def doctor(*arguments: object) -> tuple[int, dict[str, dict[str, str]]]:
     result = turbopi("doctor", "--json", *arguments)
     document = json.loads(result.stdout)
     assert document["ok"] == (result.exit_code == 0)
+    assert (
+        document["system"]["packages"]["numpy"] == metadata.version("numpy")
+        and "Linux" in document["system"]["platform"]
+    )
     return result.exit_code, {row["name"]: row for row in document["checks"]}
 
 

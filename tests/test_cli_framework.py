@@ -319,7 +319,10 @@ def test_our_own_fault_shows_its_traceback_and_is_code_3(capsys: Any) -> None:
     code, text = errors_of(raising(KeyError("vision")), capsys)
     assert code == 3
     assert text.startswith("Traceback")
-    assert text.endswith("this is a fault of Turbo-Pi's own (KeyError); please report it with the traceback\n")
+    assert text.endswith(
+        "this is a fault of Turbo-Pi's own (KeyError); please report it with the traceback "
+        "and what `turbopi doctor --json` prints\n"
+    )
 
 
 def test_a_file_that_cannot_be_used_is_named(capsys: Any) -> None:

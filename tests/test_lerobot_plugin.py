@@ -82,6 +82,13 @@ def ran_smolvla(tmp_path_factory: pytest.TempPathFactory) -> Path:
         smolvla_golden.make_checkpoint(name, folder / name / "checkpoint")
         for file in ("case.json", "inputs.npz"):
             shutil.copy(smolvla_golden.GOLDEN / name / file, folder / name)
+    (folder / "aloha").mkdir()
+    _, kept = smolvla_golden.make_aloha(folder / "aloha" / "checkpoint")
+    inputs: dict[str, Any] = kept | {f"{run}/task": np.array(["pick up the cup"]) for run in range(2)}
+    np.savez(folder / "aloha" / "inputs.npz", **inputs)
+    (folder / "aloha" / "case.json").write_text(
+        json.dumps({"kind": "smolvla", "runs": [{"observation": 0}, {"observation": 1}]})
+    )
     done = in_lerobot("-m", "lerobot_cases.plugin", folder, HF_HUB_CACHE=str(hub))
     assert done.returncode == 0, done.stderr[-4000:]
     return folder
@@ -96,6 +103,13 @@ def test_smolvlas_actions_are_lerobots(ran_smolvla: Path, name: str) -> None:
     for key in [*runs, "selected_actions"]:
         steps = min(len(found[key]), len(stored[key]))
         assert rms(found[key][:steps], stored[key][:steps]) <= 2e-5, key
+
+
+def test_smolvlas_of_aloha_are_lerobots(ran_smolvla: Path) -> None:
+    found = np.load(ran_smolvla / "aloha" / "plugin.npz")
+    stored = np.load(smolvla_golden.GOLDEN / "special_tokens/aloha.npz")
+    for key in ("0/actions", "1/actions"):
+        assert rms(found[key], stored[key]) <= 2e-5, key
 
 
 PI0_FAST = ("quantiles_empty_camera", "relative")

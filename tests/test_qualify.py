@@ -4,6 +4,7 @@ The GPU's answers are stand-ins; tests/test_gpu_qualify.py plants three on a GPU
 """
 
 import dataclasses
+import sys
 import weakref
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from test_fused_choice import OnCpu, kernels  # noqa: F401
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends import qualification
+from turbopi.backends import qualification, qualifying
 from turbopi.backends.qualification import DENOISE
 from turbopi.backends.qualifying import STAGES, Event
 from turbopi.checkpoint.random_weights import random_checkpoint
@@ -27,7 +28,8 @@ from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import BESIDE
 from turbopi.kernels.plain import PLAIN
 from turbopi.models.smolvla.family import BASE
-from turbopi.qualify import run, stages
+from turbopi.qualify import ahead, run, stages
+from turbopi.qualify.ahead import Ahead
 from turbopi.qualify.operations import BOUND, Comparison
 from turbopi.qualify.stages import Faulty, Raced, Subject, race, shallow
 from turbopi.support.errors import DeviceLost
@@ -355,25 +357,82 @@ RACING = Subject(SIX_LAYERS, "bf16", CPU, lambda *event: None, {})
 @pytest.mark.parametrize(("ours", "wins"), [(20.0, True), (29.9, False), (31.0, False)])
 def test_what_is_faster_by_more_than_noise_wins(ours: float, wins: bool, policies: Policies) -> None:
     policies.milliseconds["fused"] = ours
-    raced = race(RACING, None)
+    raced = race(RACING, None, lambda: None)
     assert raced.wins == wins and raced.note == ""
     assert raced.milliseconds == {"fused": {"total": ours}, "cuda_graph": {"total": 30.0}}
 
 
 def test_a_clock_that_varies_is_said_and_hits_both(policies: Policies) -> None:
     policies.jitter = 1.0
-    assert race(RACING, None).note == "times varied by more than 15 %: was the GPU used by others?"
+    assert race(RACING, None, lambda: None).note == "times varied by more than 15 %: was the GPU used by others?"
 
 
 def test_without_memory_for_both_they_run_one_after_the_other(policies: Policies) -> None:
     policies.room = 1
-    raced = race(RACING, None)
+    raced = race(RACING, None, lambda: None)
     assert raced.wins and raced.note == "one after the other, as the memory isn't enough for both"
     policies.room = 0
     with pytest.raises(torch.OutOfMemoryError):
-        race(RACING, None)
+        race(RACING, None, lambda: None)
 
 
 def test_where_nothing_else_has_the_precision_it_is_timed_alone(policies: Policies) -> None:
-    raced = race(dataclasses.replace(RACING, rival=None), None)
+    raced = race(dataclasses.replace(RACING, rival=None), None, lambda: None)
     assert raced.wins and set(raced.milliseconds) == {"fused"} and raced.note == ""
+
+
+# -- the process that works ahead --------------------------------------------------------------------------------------
+
+REQUEST = qualifying.Request(device=0, precision="bf16", kind="pi05", model={}, excluded={})
+SAYS = """
+import json, sys
+sys.stdin.readline()
+print('{"certified": {"actions": 0.5}}', flush=True)
+print('{"rival": true}', flush=True)
+for _ in sys.stdin:
+    print('{"turn": {"total": 30.0}}', flush=True)
+"""
+
+
+def ahead_of(script: str, monkeypatch: pytest.MonkeyPatch) -> Ahead:
+    monkeypatch.setattr(ahead, "_command", lambda: [sys.executable, "-c", script])
+    return Ahead(REQUEST)
+
+
+def test_what_was_done_ahead_is_taken_over(quick: Subject, policies: Policies, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "golden", lambda subject: "a checkpoint")
+    monkeypatch.setattr(run, "race", race)
+    monkeypatch.setitem(policies.milliseconds, "pytorch", 20.0)
+    monkeypatch.setattr(stages, "random_checkpoint", lambda config: None)
+    monkeypatch.setattr(ahead, "PATIENCE", 600.0)
+    said: list[Event] = []
+    beside = ahead_of(SAYS, monkeypatch)
+    assert run.run(quick, said.append, beside)
+    (shipped,) = (one.stage for one in said if one.stage is not None and one.stage.name == STAGES[4])
+    assert shipped.figures == {"actions": 0.5}
+    assert [one.milliseconds for one in said if one.milliseconds] == [
+        {"pytorch": {"total": 20.0}, "other": {"total": 30.0}}
+    ]
+    assert beside.certified({DENOISE: "off"}) is None, "it was certified with that path"
+    assert beside.stop() and not beside.stop()
+    with pytest.raises(torch.OutOfMemoryError, match="ended"):
+        beside._turn()
+
+
+@pytest.mark.parametrize("script", ["", "import time; time.sleep(600)", "print('{}', flush=True)"])
+def test_what_was_not_done_ahead_is_done_now(script: str, quick: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ahead, "PATIENCE", 0.3)
+    beside = ahead_of(script, monkeypatch)
+    assert beside.certified({}) is None and beside.rival() is None
+    assert run.run(quick, lambda event: None, beside)
+
+
+def test_its_memory_is_given_back_where_it_is_missing(quick: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    def certify(*given: object) -> dict[str, float]:
+        if beside._process is not None:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return {"actions, error over bound": 0.5}
+
+    beside = ahead_of(SAYS, monkeypatch)
+    monkeypatch.setattr(run, "certify", certify)
+    assert run.run(quick, lambda event: None, beside)

@@ -1,6 +1,7 @@
 """Result documents: each kind is one Struct; what is checked in reads through it and comes out as it was."""
 
 import json
+import lzma
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -121,7 +122,14 @@ def test_what_no_json_may_hold_is_refused_in_documents_too(text: str, said: str,
 
 # -- what is checked in ------------------------------------------------------------------------------------------------
 
-EVERY = sorted(path.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("*.json"))
+EVERY = sorted(
+    path.relative_to(RESULTS).as_posix() for end in ("json", "json.xz") for path in RESULTS.rglob(f"*.{end}")
+)
+
+
+def text_of(name: str) -> str:
+    data = (RESULTS / name).read_bytes()
+    return (lzma.decompress(data) if name.endswith(".xz") else data).decode()
 
 
 def _provenance(content: object) -> list[dict[str, object]]:
@@ -136,7 +144,7 @@ def _provenance(content: object) -> list[dict[str, object]]:
 
 
 def test_every_provenance_that_is_checked_in_reads_and_comes_out_as_it_was() -> None:
-    found = {name: _provenance(json.loads((RESULTS / name).read_text())) for name in EVERY}
+    found = {name: _provenance(json.loads(text_of(name))) for name in EVERY}
     assert sum(map(len, found.values())) > 70
     more = {"clocks_at_the_end", "command", "environment"}  # a benchmark's own
     for name, all_of_it in found.items():
@@ -149,12 +157,12 @@ def test_every_provenance_that_is_checked_in_reads_and_comes_out_as_it_was() -> 
 SHORTENED = {
     "h200_2026-11-21_pi05_libero_tensorrt.json": r"results\[0\]\.milliseconds\.preprocess is .*; expected an object",
 }
-BENCHMARKS = [name for name in EVERY if '"floors"' in (RESULTS / name).read_text()]
+BENCHMARKS = [name for name in EVERY if '"floors"' in text_of(name)]
 
 
 @pytest.mark.parametrize("name", [name for name in BENCHMARKS if name not in SHORTENED])
 def test_a_checked_in_benchmark_reads_and_comes_out_as_it_was(name: str) -> None:
-    content = json.loads((RESULTS / name).read_text())
+    content = json.loads(text_of(name))
     document = read_benchmark(RESULTS / name)
     for job in (content["main_job"], *(result["job"] for result in content["results"])):
         if job.get("image_width") == 224:  # one file's version wrote the usual size, too
@@ -182,27 +190,27 @@ def test_a_benchmark_reads_the_same_whichever_way_a_number_is_written() -> None:
     assert fingerprint(as_document(content, BenchDocument, "FILE")) == fingerprint(whole) != fingerprint(first)
 
 
-CONTENTS = {name: json.loads((RESULTS / name).read_text()) for name in EVERY}
+CONTENTS = {name: json.loads(text_of(name)) for name in EVERY}
 OF_TURNS = [name for name, of in CONTENTS.items() if isinstance(of, dict) and {"rows", "provenance"} <= of.keys()]
 
 
-@pytest.mark.parametrize("name", [name for name in OF_TURNS if "mhz" in (RESULTS / name).read_text()])
+@pytest.mark.parametrize("name", [name for name in OF_TURNS if "mhz" in text_of(name)])
 def test_checked_in_turns_of_kernels_read_and_come_out_as_they_were(name: str) -> None:
     document = read_turns(RESULTS / name)
     assert document.rows
-    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads(text_of(name)))
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if '"turbopi-attack"' in (RESULTS / name).read_text()[:99]])
+@pytest.mark.parametrize("name", [name for name in EVERY if '"turbopi-attack"' in text_of(name)[:99]])
 def test_checked_in_attacks_read_and_come_out_as_they_were(name: str) -> None:
-    document = read_document(RESULTS / name, AttackDocument, ConfigError)
+    document = as_document(json.loads(text_of(name)), AttackDocument, name)
     assert len(document.pieces) > 3
-    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads(text_of(name)))
 
 
 def test_checked_in_load_tests_read_and_come_out_as_they_were() -> None:
     for name in EVERY:
-        if '"turbopi-load"' in (text := (RESULTS / name).read_text())[:99]:
+        if '"turbopi-load"' in (text := text_of(name))[:99]:
             assert json.dumps(plain_document(read_load(RESULTS / name)), indent=1) + "\n" == text
 
 

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_checkpoint, make_hub, relative
+from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_aloha, make_checkpoint, make_hub, relative
 
 from turbopi import UnifiedPolicy
+from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.fused_smolvla import FusedSmolVLABackend
 from turbopi.checkpoint import open_checkpoint
 from turbopi.preprocess.images import fit_unit, fitted
 from turbopi.realtime.running_chunk import RunningChunk
@@ -47,6 +49,22 @@ def test_a_folder_of_lerobots_gives_its_actions(name: str, folders: Path, hub: P
     for run in range(len(golden)):
         actions = policy.infer(golden.observation(run), noise=golden.noise)["actions"]
         assert relative(actions, golden.actions(run, "float32/" if name == "bf16" else "")) <= 2e-5  # seen: 3e-6
+
+
+def test_aloha_and_tokens_around_cameras_that_are_not_there_are_lerobots(hub: Path, tmp_path: Path) -> None:
+    """By tools/lerobot_cases/smolvla_aloha.py. One camera is always missing, and one in the second observation."""
+    folder, kept = make_aloha(tmp_path / "aloha")
+    policy = UnifiedPolicy(folder, precision="f32")
+    seen = [{key[2:]: one for key, one in kept.items() if key.startswith(f"{run}/observation")} for run in range(2)]
+    for run, one in enumerate(seen):
+        actions = policy.infer({**one, "task": "pick up the cup"}, noise=kept["noise"])["actions"]
+        assert relative(actions, kept[f"{run}/actions"]) <= 2e-5
+    several = policy.infer_batch([{**one, "task": "pick up the cup"} for one in seen], seed=1)
+    for row, one in enumerate(seen):
+        alone = policy.infer({**one, "task": "pick up the cup"}, seed=1 + row)["actions"]
+        assert relative(several[row]["actions"], alone) <= 1e-5
+    for backend in (CapturedBackend, FusedSmolVLABackend):
+        assert "tokens around images that aren't" in str(backend.refuses_model(policy.config.model))
 
 
 def test_bfloat16_is_lerobots_own(folders: Path, hub: Path) -> None:
@@ -109,7 +127,7 @@ def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"adapt_to_pi_aloha": True}, "adapt_to_pi_aloha = True, which Turbo-Pi doesn't compute"),
+        ({"adapt_to_pi_aloha": True}, "for 14 joints and grippers, but the state has 6 values and an action 6"),
         ({"resize_imgs_with_padding": [512, 384]}, r"resize_imgs_with_padding = \[512, 384\]"),
         ({"resize_imgs_with_padding": None}, "resize_imgs_with_padding = None"),
         ({"num_vlm_layers": 0}, "num_vlm_layers is 0"),

@@ -217,6 +217,11 @@ def memory_of(model: Network) -> MemoryConfig | None:
     return model.memory if isinstance(model, ModelConfig) else None
 
 
+def empty_cameras(model: Network) -> int:
+    """Cameras that a network reads tokens around though their images are masked; SmolVLA alone has some."""
+    return int(getattr(model, "empty_cameras", 0))
+
+
 @dataclass(frozen=True)
 class Pi0FastConfig:
     """The network of a Pi0-FAST, and how its answers are read.
@@ -331,6 +336,7 @@ class PolicyConfig:
     real_time: RealTime = RealTime()
     missing_cameras: MissingCameras = "masked"  # "black": seen as black images, as by openpi's Pi0-FAST
     prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so
+    turns_aloha: bool = False  # normalised joints of ALOHA are turned: LeRobot's SmolVLA with adapt_to_pi_aloha
 
     @property
     def planned_model(self) -> ModelConfig:

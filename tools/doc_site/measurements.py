@@ -80,7 +80,7 @@ def _others(root: Path) -> Iterator[list[str]]:
     shown = {program: name for name, program in peers.SHOWN.items()}
     for file in (root / peers.FOLDER / run for run in peers.RUNS if not run.startswith("ours")):
         measured = peers.read_run(file)
-        for program, setting, horizon in sorted({(key[0], key[1], key[3]) for key in measured}):
+        for program, setting, horizon in sorted({(key[0], key[1], key[3]) for key in measured if measured[key]}):
             name, _, precision = shown.get((program, setting), f"{program}, {setting}").partition(", ")
             whole, device = (measured.get((program, setting, kind, horizon)) for kind in (peers.WHOLE, peers.DEVICE))
             times = ["" if whole is None else f"{whole:.2f}", "", "" if device is None else f"{device:.2f}", "", ""]

@@ -6,6 +6,7 @@ at a device of that compute capability that isn't there.
 """
 
 import json
+import lzma
 import re
 import shutil
 from collections.abc import Iterator
@@ -31,7 +32,7 @@ from turbopi.support.reading import read_document
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TESTED = "*_gpu_check.json"
-COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json"  # the second of an H100 or H200; its newest counts
+COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json*"  # the second of an H100 or H200; its newest counts
 DEVICE = torch.device("cuda", 0)
 RACED = ("fused", "cuda_graph")
 QUALIFIED = " *"  # behind what `auto` takes where it isn't qualified: then it may be `fused`
@@ -92,7 +93,8 @@ def rows_of(file: Path) -> list[dict[str, object]]:
     """The `rows` of a result file, each of a kernel for a `target`; none where the file isn't there yet."""
     if not file.is_file():
         return []
-    document = json.loads(file.read_text(encoding="utf-8"))
+    packed = file.read_bytes()
+    document = json.loads(lzma.decompress(packed) if file.suffix == ".xz" else packed)
     rows = document.get("rows", []) if isinstance(document, dict) else []
     return [row for row in rows if isinstance(row, dict) and "target" in row]
 

@@ -1,7 +1,8 @@
 """Our latency beside other programs': docs/performance.md's table, README's plot, from h200_2026-11-28_peers/.
 
-A run is one file as its program wrote it: ours a benchmark (.json), the others a JSON object a line (.jsonl) or a line
-of text each (.txt). What was built how: the README beside them.
+A run is a file of `python -m peers run` (tools/peers). Older ones are as their program wrote them: ours a benchmark
+(.json), the others a JSON object a line (.jsonl) or a line of text each (.txt). What was built how: the README beside
+them.
 """
 
 import hashlib
@@ -14,6 +15,7 @@ from typing import Annotated
 from matplotlib.figure import Figure
 from msgspec import Meta, Struct
 from msgspec.structs import replace
+from peers.document import PARTS, Part, read_peers_run
 from PIL import Image
 
 from doc_tables.drawn import compacted
@@ -22,16 +24,17 @@ from turbopi.bench.plots import DRAWN_OF
 from turbopi.bench.work import Job
 from turbopi.support.errors import ConfigError
 from turbopi.support.plots import MEASURED, MUTED, write_figure
-from turbopi.support.reading import as_document
+from turbopi.support.reading import as_document, read_json
 
 FOLDER = Path("benchmarks") / "results" / "h200_2026-11-28_peers"
 RUNS = ("ours_beside_flashrt_openpi.json", "flashrt_openpi.jsonl", "realtime_vla.txt", "lerobot.jsonl")
 PLOT = Path("docs") / "latency.png"
 TEXT = "#7d8590"  # legible on white and on black: the background is the page's
 
-WHOLE, DEVICE = "whole call", "on the GPU"
-Key = tuple[str, str, str, int]  # program, setting, WHOLE or DEVICE, horizon
-Milliseconds = Mapping[Key, float]  # medians of one job: Pi0.5 of full size, 2 cameras, 48 prompt tokens, 10 steps
+WHOLE, DEVICE = PARTS
+Key = tuple[str, str, Part, int]  # program, setting, WHOLE or DEVICE, horizon
+# Medians of one job: Pi0.5 of full size, 2 cameras, 48 prompt tokens, 10 steps. None: tried, and the file says why not.
+Milliseconds = Mapping[Key, float | None]
 
 # name in the documents -> (program, setting), as the outputs name them
 SHOWN = {
@@ -43,10 +46,12 @@ SHOWN = {
     "openpi, PyTorch compiled": ("openpi-pytorch", "bf16 reduce-overhead"),
     "LeRobot, PyTorch eager": ("lerobot", "bf16 eager"),
     "openpi, PyTorch eager": ("openpi-pytorch", "bf16 eager"),
+    "SGLang, bf16": ("sglang", "bf16"),
+    "vLLM-Omni, bf16": ("vllm-omni", "bf16"),
 }
 DRAWN = ("Turbo-Pi, FP8", "Turbo-Pi, bf16", "FlashRT, FP8", "FlashRT, bf16", "openpi, PyTorch compiled")
 
-_KINDS = {
+_KINDS: dict[str, Part] = {
     "whole call, host uint8 to host actions": WHOLE,
     "device tensors to device actions": DEVICE,
     "graph replay": DEVICE,
@@ -64,7 +69,7 @@ class _Row(Struct, frozen=True):
 
 def read_run(file: Path) -> Milliseconds:
     """Medians of one run's jobs that the table has. Raises ConfigError, a ValueError, for a file without any."""
-    read = {".json": _ours, ".jsonl": _rows, ".txt": _lines}.get(file.suffix)
+    read = {".json": _json, ".jsonl": _rows, ".txt": _lines}.get(file.suffix)
     if read is None:
         raise ConfigError(f"{file}: a peer's run is a .json, .jsonl or .txt file")
     found = read(file)
@@ -73,9 +78,20 @@ def read_run(file: Path) -> Milliseconds:
     return found
 
 
-def _ours(file: Path) -> dict[Key, float]:
-    document = read_benchmark(file)
+def _json(file: Path) -> Milliseconds:
     job = Job()
+    if read_json(file, ConfigError).get("kind") == "turbopi-peers":
+        run = read_peers_run(file)
+        found: dict[Key, float | None] = {
+            (one.program, one.setting, part, (one.job or job).horizon): None
+            for one in run.not_measured
+            for part in PARTS
+        }
+        for one in run.timed:
+            if replace(one.job, horizon=job.horizon) == job:
+                found[one.program, one.setting, one.part, one.job.horizon] = one.p50_ms
+        return found
+    document = read_benchmark(file)
     return {
         ("turbopi", result.precision, kind, result.job.horizon): result.milliseconds[name].p50
         for result in document.results
@@ -84,7 +100,7 @@ def _ours(file: Path) -> dict[Key, float]:
     }
 
 
-def _rows(file: Path) -> dict[Key, float]:
+def _rows(file: Path) -> Milliseconds:
     found = {}
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
         if line:
@@ -95,7 +111,7 @@ def _rows(file: Path) -> dict[Key, float]:
     return found
 
 
-def _lines(file: Path) -> dict[Key, float]:
+def _lines(file: Path) -> Milliseconds:
     lines = (_LINE.fullmatch(line) for line in file.read_text(encoding="utf-8").splitlines())
     return {(of["program"], of["setting"], DEVICE, int(of["horizon"])): float(of["ms"]) for of in lines if of}
 
@@ -106,7 +122,10 @@ def peers(*runs: Milliseconds) -> list[str]:
     lines = [f"| ms | {WHOLE}, H = 10 | H = 50 | {DEVICE}, H = 10 | H = 50 |", "|---|--:|--:|--:|--:|"]
     for name, program in SHOWN.items():
         cells = [every.get((*program, kind, horizon)) for kind in (WHOLE, DEVICE) for horizon in (10, 50)]
-        lines.append("| " + " | ".join([name, *("" if ms is None else _shown(ms) for ms in cells)]) + " |")
+        if any(cells):
+            lines.append("| " + " | ".join([name, *("" if ms is None else _shown(ms) for ms in cells)]) + " |")
+        elif any(key[:2] == program for key in every):
+            lines.append(f"| {name} | not measured | | | |")
     return lines
 
 
@@ -118,14 +137,13 @@ def _shown(ms: float) -> str:
 
 
 def bars(root: Path) -> list[tuple[str, float]]:
-    """(name, milliseconds) of the plot's programs with chunks of 10: a whole call, or else the GPU's part."""
+    """(name, milliseconds) of the plot's programs with chunks of 10: a whole call, or else the GPU's part; if any."""
     every = {key: ms for run in RUNS for key, ms in read_run(root / FOLDER / run).items()}
     found = []
     for name in DRAWN:
         whole, device = (every.get((*SHOWN[name], kind, 10)) for kind in (WHOLE, DEVICE))
-        ms = whole or device
-        assert ms is not None, f"{name} has no call with chunks of 10"
-        found.append((name if whole else f"{name} ({DEVICE} alone)", ms))
+        if ms := whole or device:
+            found.append((name if whole else f"{name} ({DEVICE} alone)", ms))
     return found
 
 

@@ -21,7 +21,7 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
-from turbopi.config import ImageResize, memory_of
+from turbopi.config import ImageResize, Network, empty_cameras, memory_of
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.plan import cold_call
 from turbopi.engine.resize import Resizer
@@ -96,6 +96,15 @@ class CapturedBackend(PyTorchBackend):
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
         return CudaGraphBackend.unavailable(device)
+
+    @classmethod
+    def refuses_model(cls, config: Network) -> str | None:
+        if empty_cameras(config):
+            return (
+                f"backend {cls.name!r} runs the cameras that are there, and this model reads tokens around images that "
+                "aren't (add_image_special_tokens with empty_cameras); take backend 'pytorch'"
+            )
+        return super().refuses_model(config)
 
     def load_weights(self, load: LoadState) -> None:
         make_caches_writable()

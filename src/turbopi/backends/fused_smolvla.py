@@ -61,6 +61,8 @@ class FusedSmolVLABackend(CapturedBackend):
     def refuses_model(cls, config: Network) -> str | None:
         if not isinstance(config, SmolVLAConfig):
             return FusedBackend.refuses_model(config)
+        if (refused := super().refuses_model(config)) is not None:
+            return refused
         why = smolvla.refusal(config)
         return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'cuda_graph'"
 

@@ -97,7 +97,7 @@ SMOLVLA = Keys(
         | {
             *("resize_imgs_with_padding", "num_steps", "vlm_model_name", "load_vlm_weights", "attention_mode"),
             *("add_image_special_tokens", "prefix_length", "num_expert_layers", "num_vlm_layers"),
-            *("self_attn_every_n_layers", "expert_width_multiplier", "min_period", "max_period"),
+            *("self_attn_every_n_layers", "expert_width_multiplier", "min_period", "max_period", "adapt_to_pi_aloha"),
         }
     ),
     frozenset(
@@ -111,7 +111,6 @@ SMOLVLA = Keys(
         }
     ),
     {
-        "adapt_to_pi_aloha": ((False,), "the state and the actions as the dataset has them"),
         "use_delta_joint_actions_aloha": ((False,), "absolute actions (LeRobot itself refuses it)"),
         "use_cache": ((True,), "keys and values of the prefix once a call (LeRobot itself can't do without)"),
     },

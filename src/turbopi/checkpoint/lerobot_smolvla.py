@@ -29,6 +29,7 @@ _COUNTS = {  # keys, and the limits of turbopi.config for them
     "max_state_dim": "action_dim",
     "max_action_dim": "action_dim",
 }
+ALOHA_JOINTS = 14
 _TOKENIZER, _TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
 
 
@@ -63,12 +64,22 @@ class SmolVLAFolder(LeRobotFolder):
             robot="lerobot",
             normalization=self.normalization,
             robot_options=self._robot_options(),
+            turns_aloha=self._turns_aloha(),
             discrete_state_input=False,
             image_resize="lerobot_smolvla",
             prompt_as_is=True,
             num_denoising_steps=self._steps("num_steps"),
             real_time=self._real_time(),
         )
+
+    def _turns_aloha(self) -> bool:
+        turns = self.config.flag("adapt_to_pi_aloha", False)
+        if turns and min(self.state_dim, self.action_dim) < ALOHA_JOINTS:
+            raise CheckpointError(
+                f"{self.file} has adapt_to_pi_aloha = true, for {ALOHA_JOINTS} joints and grippers, but the state has "
+                f"{self.state_dim} values and an action {self.action_dim}; LeRobot can't run it either"
+            )
+        return turns
 
     def notes(self) -> list[str]:
         notes = super().notes()

@@ -100,6 +100,9 @@ def _local(path: str | Path) -> Path:
     hint = ""
     if re.fullmatch(r"[\w.-]+/[\w.-]+", text):
         hint = f". If it is a name on the Hugging Face hub, fetch it first: hf download {text} --local-dir DIR"
+    shipped = Path(__file__).parents[1] / "data" / folder.name
+    if (shipped / PACKED).is_file():
+        hint = f"; the one that comes with Turbo-Pi is {shipped}"
     raise CheckpointError(f"there is no folder {folder}{hint}")
 
 

@@ -1,5 +1,6 @@
 """What `turbopi doctor` looks at. Each check is a function that returns a row; none of them changes anything."""
 
+import contextlib
 import os
 import platform
 import shutil
@@ -72,6 +73,19 @@ def check_packages() -> Row:
     if problems:
         return Row("FAIL", "packages", "; ".join(problems), install_command())
     return Row("OK", "packages", f"turbopi {version} and all that it requires")
+
+
+def system() -> dict[str, Any]:
+    """The operating system, and the versions of what Turbo-Pi requires and its extras may: for reports."""
+    try:
+        names = {Requirement(one).name for one in metadata.requires("turbopi") or []}
+    except metadata.PackageNotFoundError:
+        names = set()
+    found = {}
+    for name in sorted(names | {"turbopi"}):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return {"platform": platform.platform(), "packages": found}
 
 
 def check_torch() -> Row:

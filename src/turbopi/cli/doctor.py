@@ -56,7 +56,7 @@ def doctor(
     itself, in one.
     """
     output = Output(as_json)
-    from turbopi.cli.checkups import examine
+    from turbopi.cli.checkups import examine, system
 
     if force and not qualify:
         raise ConfigError("--force goes with --qualify")
@@ -74,7 +74,9 @@ def doctor(
     if found:
         show_backends(found, output)
     output.line(summary, STYLES["FAIL" if counts["FAIL"] else "OK"])
-    output.document({"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows], **found, **verdict})
+    output.document(
+        {"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows], **found, **verdict, "system": system()}
+    )
     if counts["FAIL"]:
         raise typer.Exit(CHECK_FAILED)
 

@@ -250,7 +250,8 @@ def with_errors_reported(work: Callable[[], None], *, debug: bool, owner: str = 
         if debug or message is None:
             traceback.print_exc()
         if message is None:
-            message = f"this is a fault of {owner} ({type(error).__name__}); please report it with the traceback"
+            message = f"this is a fault of {owner} ({type(error).__name__}); please report it with the traceback "
+            message += "and what `turbopi doctor --json` prints"
         console = new_console(stderr=True)
         said = f"[bold red]error:[/] {escape(_shortened(message))}"
         console.print(said, highlight=False, soft_wrap=not console.is_terminal)

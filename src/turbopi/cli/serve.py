@@ -219,6 +219,14 @@ def serve(
             help="Refuse requests that warm-up didn't cover, which would take a second or more.",
         ),
     ] = False,
+    traces: Annotated[
+        bool,
+        typer.Option(
+            "--traces",
+            rich_help_panel=_NETWORK,
+            help="Spans of each call to OpenTelemetry, where OTEL_EXPORTER_OTLP_ENDPOINT says (turbopi[otel]).",
+        ),
+    ] = False,
     settings: Settings = None,
     print_all: PrintSettings = False,
     ray: Ray = False,
@@ -260,6 +268,7 @@ def serve(
         control_hz=control_hz,
         execution_horizon=execution_horizon,
         delay_steps=delay_steps,
+        traces=traces,
     )
     if record is not None:
         check_folder(record)

@@ -32,6 +32,7 @@ OF_SERVERS = {
     "record_images": "--record-images",
     "allowed_hosts": "--allowed-hosts",
     "max_clients": "--max-clients",
+    "traces": "--traces",
     "page": "--page",
     "execution": "--execution",
     "control_hz": "--control-hz",

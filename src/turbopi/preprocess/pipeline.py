@@ -27,6 +27,7 @@ from turbopi.preprocess.robot_checks import (
 )
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
+from turbopi.robots.aloha import smolvla_actions, smolvla_state
 from turbopi.robots.base import Example, all_finite, keys_of, listed, read_prompt, read_state
 from turbopi.robots.images import check_hwc, is_rgb8, to_uint8
 from turbopi.robots.lerobot import LeRobot
@@ -302,6 +303,8 @@ class Pipeline:
         if len(state) > limit and family_of(self.config.model).reads_state:
             raise ObservationError(f"the state has {len(state)} values, but the model takes at most {limit}")
         sample.state = self.state_scale.normalize(state)
+        if self.config.turns_aloha:
+            sample.state = smolvla_state(sample.state)
 
     def _resize_images(self, sample: Incoming) -> None:
         camera_images, present = sample.robot.images, sample.robot.image_mask
@@ -360,7 +363,8 @@ class Pipeline:
     # After the model
 
     def _unnormalize(self, out: _Outgoing) -> None:
-        steps = out.actions.reshape(-1, out.actions.shape[-1])  # [B * H, d]
+        actions = smolvla_actions(out.actions) if self.config.turns_aloha else out.actions
+        steps = actions.reshape(-1, actions.shape[-1])  # [B * H, d]
         out.actions = self.action_scale.unnormalize(steps).reshape(out.actions.shape)
 
     def _make_absolute(self, out: _Outgoing) -> None:

@@ -10,6 +10,7 @@ from turbopi.backends import qualification
 from turbopi.backends.qualification import Stage
 from turbopi.backends.qualifying import STAGES, Event
 from turbopi.checkpoint.random_weights import random_checkpoint
+from turbopi.qualify.ahead import Ahead
 from turbopi.qualify.stages import (
     COMPILING,
     Faulty,
@@ -18,6 +19,7 @@ from turbopi.qualify.stages import (
     certify,
     check_grid,
     check_kernels,
+    free,
     golden,
     race,
     shallow,
@@ -28,10 +30,13 @@ Say = Callable[[Event], None]
 BUSY_DEVICE = "busy or unavailable"  # of CUDA's error where another process has the GPU for itself
 
 
-def run(subject: Subject, say: Say) -> bool:
-    """Whether it came to a verdict. Failures are said; those that nobody expected are raised, too."""
+def run(subject: Subject, say: Say, beside: Ahead | None = None) -> bool:
+    """Whether it came to a verdict. Failures are said; those that nobody expected are raised, too.
+
+    beside: the process that works ahead.
+    """
     try:
-        run_stages(subject, say)
+        run_stages(subject, say, beside)
         return True
     except Faulty as fault:
         say(Event(failed=str(fault)))
@@ -44,7 +49,13 @@ def run(subject: Subject, say: Say) -> bool:
     return False
 
 
-def run_stages(subject: Subject, say: Say) -> None:
+def certify_shipped(subject: Subject) -> Figures:
+    """None of them where no policy ships that the backend runs as it runs the model."""
+    policy = golden(subject)
+    return {} if policy is None else certify(subject, policy, subject.quantization(policy))
+
+
+def run_stages(subject: Subject, say: Say, beside: Ahead | None) -> None:
     """Raises Faulty for what isn't right and has no other path beside it."""
     qualification.under_test = subject.excluded  # which the backends of this process look at
 
@@ -63,6 +74,10 @@ def run_stages(subject: Subject, say: Say) -> None:
                 if not fault.path or fault.path in subject.excluded:
                     raise
                 exclude(fault.path, str(fault))
+            except torch.OutOfMemoryError:
+                if beside is None or not beside.stop():
+                    raise
+            free(subject.device)
         seconds = round(time.monotonic() - began, 2)
         say(Event(stage=Stage(name=name, seconds=seconds, text=text(figures), figures=figures)))
 
@@ -79,7 +94,7 @@ def run_stages(subject: Subject, say: Say) -> None:
     stage(STAGES[2], lambda: certify(subject, small, calibration), _worst)
 
     def timed() -> Figures:
-        raced = race(subject, calibration)
+        raced = race(subject, calibration, beside.rival if beside is not None else lambda: None)
         figures = {f"{name} ms": times["total"] for name, times in raced.milliseconds.items()}
         reason = f"right; {_times(figures)}" + (f" ({raced.note})" if raced.note else "")
         taken: Any = subject.name if raced.wins else subject.rival
@@ -88,8 +103,13 @@ def run_stages(subject: Subject, say: Say) -> None:
 
     stage(STAGES[3], timed, _times)
     raced_without = set(subject.excluded)
-    if (policy := golden(subject)) is not None:
-        stage(STAGES[4], lambda: certify(subject, policy, subject.quantization(policy)), _worst)
+
+    def shipped() -> Figures:
+        found = None if beside is None else beside.certified(subject.excluded)
+        return certify_shipped(subject) if found is None else found
+
+    if golden(subject) is not None:
+        stage(STAGES[4], shipped, _worst)
     if raced_without != set(subject.excluded):
         timed()
     say(Event(done=True))

@@ -1,7 +1,7 @@
 """The stages of qualifying, each of which raises `Faulty` for what isn't right."""
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
@@ -24,7 +24,6 @@ from turbopi.kernels.ops import hopper_kernels
 from turbopi.models import RANDOM
 from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy import shipped
-from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.qualify.operations import COMPILING, At, Comparison
@@ -48,6 +47,7 @@ MARGIN = 0.01  # of the time of `cuda_graph`: less is noise
 RACE_TURNS, CALLS = 5, 9  # of each backend, and calls of a turn, beside those that warm it
 PARTS = ("total", "vision", "prefix", "denoise")  # of a call's time
 Figures = dict[str, float]  # by what they are of
+Turn = Callable[[], Figures]  # some calls; medians of each of PARTS
 OF_DENOISING = ("x_t", "v_t", "actions")
 
 
@@ -267,42 +267,36 @@ class Raced:
     note: str
 
 
-def race(subject: Subject, quantization: Quantization | None) -> Raced:
-    """Calls of the whole model with random weights, of both in turns where the memory is enough for both."""
-    config, model = subject.policy_config(subject.model), subject.model
-    checkpoint = random_checkpoint(config)
-    given: Any = None if quantization is None else stretched(quantization, checkpoint)
-    job = Job(2, min(48, model.max_prompt_tokens), model.action_horizon, config.num_denoising_steps)
+def race(subject: Subject, quantization: Quantization | None, warm_rival: Callable[[], Turn | None]) -> Raced:
+    """Calls of the whole model with random weights, of both in turns where the memory is enough for both.
+
+    warm_rival: the rival's turns of another process; it is made here where that has none.
+    """
     times: dict[str, list[Figures]] = {}
     notes = []
 
-    def policy(name: str) -> UnifiedPolicy:
-        subject.at(f"{name} at full size", "", COMPILING)
-        return bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given)
-
-    def measure(policies: dict[str, UnifiedPolicy], turns: int = RACE_TURNS) -> None:
+    def measure(racers: dict[str, Turn], turns: int = RACE_TURNS) -> None:
         for turn in range(turns):
-            for name in reversed(policies) if turn % 2 else policies:
-                found = measure_calls(policies[name], job, CALLS)
-                times.setdefault(name, []).append({part: found[part].median for part in PARTS if part in found})
+            for name in reversed(racers) if turn % 2 else racers:
+                times.setdefault(name, []).append(racers[name]())
 
-    _free(subject.device)
-    ours = policy(subject.name)
+    free(subject.device)
+    ours = turn_of(subject, subject.name, quantization)
     measure({subject.name: ours}, 1)
     memory, both = _reserved(subject.device), False
     times.clear()
     if subject.rival is not None:
         with suppress(torch.OutOfMemoryError):
-            measure({subject.rival: policy(subject.rival), subject.name: ours})
+            measure({subject.rival: warm_rival() or rival_turn(subject), subject.name: ours})
             both = True
     if not both:
         times.clear()
         measure({subject.name: ours})
         del ours
-        _free(subject.device)
+        free(subject.device)
         if subject.rival is not None:
             notes.append("one after the other, as the memory isn't enough for both")
-            measure({subject.rival: policy(subject.rival)})
+            measure({subject.rival: rival_turn(subject)})
     rows = {name: timed({}, [turn["total"] for turn in turns]) for name, turns in times.items()}
     if busy(row.spread for row in rows.values()):
         notes.append("times varied by more than 15 %: was the GPU used by others?")
@@ -315,11 +309,32 @@ def race(subject: Subject, quantization: Quantization | None) -> Raced:
     return Raced(dict(sorted(medians.items(), key=lambda one: one[0] != subject.name)), memory, wins, "; ".join(notes))
 
 
+def turn_of(subject: Subject, name: str, quantization: Quantization | None) -> Turn:
+    """Of a backend with the model at full size."""
+    config, model = subject.policy_config(subject.model), subject.model
+    checkpoint = random_checkpoint(config)
+    given: Any = None if quantization is None else stretched(quantization, checkpoint)
+    job = Job(2, min(48, model.max_prompt_tokens), model.action_horizon, config.num_denoising_steps)
+    subject.at(f"{name} at full size", "", COMPILING)
+    policy = bench_policy(checkpoint, name, subject.precision, subject.device, job, quantization=given)
+
+    def turn() -> Figures:
+        found = measure_calls(policy, job, CALLS)
+        return {part: found[part].median for part in PARTS if part in found}
+
+    return turn
+
+
+def rival_turn(subject: Subject) -> Turn:
+    assert subject.rival is not None
+    return turn_of(subject, subject.rival, None)
+
+
 def _reserved(device: torch.device) -> int:
     return torch.cuda.max_memory_reserved(device) if device.type == "cuda" else 0
 
 
-def _free(device: torch.device) -> None:
+def free(device: torch.device) -> None:
     """What nobody holds any more, and what was reserved at most so far."""
     gc.collect()
     if device.type == "cuda":

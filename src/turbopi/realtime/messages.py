@@ -27,7 +27,8 @@ MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
 MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
 MAX_SEED = 2**64 - 1
-SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot")  # the last: for people
+# The last two are for people: the page and the log, and traces.
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot", "traceparent")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset", "seed", "observe"),

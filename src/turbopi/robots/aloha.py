@@ -4,7 +4,7 @@ openpi's base models saw these arms in another convention: some joints turn the 
 positions. `adapt_to_pi` converts both ways. Source: openpi's `aloha_policy.py` (constants from Interbotix and Trossen).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,10 +35,11 @@ _ACCEPTED = frozenset((*CAMERA_OF, IGNORED))
 KEYS = ("state", *(f"images/{camera}" for camera in CAMERA_OF), "prompt")
 
 _FLIP = np.array([1.0, -1, -1, 1, 1, 1, 1] * 2)
-_GRIPPERS = slice(6, None, 7)  # 6 and 13
+_GRIPPERS = slice(6, 14, 7)  # 6 and 13
 _GRIPPER_POSITION = (0.01844, 0.058)  # m, closed and open
 _GRIPPER_JOINT = (-0.6213, 1.4910)  # rad, closed and open, in the robot's actions
 _PI_GRIPPER = (0.5476, 1.6296)  # rad, what the base models call 0 and 1
+_SMOLVLA_GRIPPER = (0.4, 1.5)  # rad, what LeRobot's SmolVLA calls 0 and 1
 _ARM, _HORN = 0.036, 0.022  # m, the gripper's linkage
 
 
@@ -91,32 +92,44 @@ class Aloha(Robot):
         return RobotInputs(images, mask, self._to_pi(state), optional_prompt(observation))
 
     def _to_pi(self, state: np.ndarray) -> np.ndarray:
-        if not self.adapt_to_pi:
-            return state
-        state = _FLIP * state
-        state[_GRIPPERS] = gripper_to_angle(state[_GRIPPERS])
-        return state
+        return turned(state, gripper_to_angle) if self.adapt_to_pi else state
 
     def outputs(self, actions: np.ndarray) -> np.ndarray:
         actions = actions[:, : self.action_dim]
-        if not self.adapt_to_pi:
-            return actions
-        actions = _FLIP * actions
-        actions[:, _GRIPPERS] = gripper_from_angle(actions[:, _GRIPPERS])
-        return actions
+        return turned(actions, gripper_from_angle) if self.adapt_to_pi else actions
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
         camera_images = {camera: np.ascontiguousarray(random_image(rng).transpose(2, 0, 1)) for camera in CAMERA_OF}
         return {"state": rng.random(self.state_dim), "images": camera_images, "prompt": "transfer cube"}
 
 
-def gripper_to_angle(position: np.ndarray) -> np.ndarray:
+def turned(values: np.ndarray, gripper: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """[..., 14 at least]: joints that turn the other way, `gripper` of the grippers, and what is behind them."""
+    joints = len(_FLIP)
+    found = np.concatenate((_FLIP * values[..., :joints], values[..., joints:]), -1)
+    found[..., _GRIPPERS] = gripper(found[..., _GRIPPERS])
+    return found
+
+
+def smolvla_state(state: np.ndarray) -> np.ndarray:
+    """A normalised state as SmolVLA sees it with LeRobot's `adapt_to_pi_aloha`: it turns normalised numbers."""
+    return turned(state, lambda position: gripper_to_angle(position, _SMOLVLA_GRIPPER))
+
+
+def smolvla_actions(actions: np.ndarray) -> np.ndarray:
+    """SmolVLA's actions as they are un-normalised then."""
+    low, high = _SMOLVLA_GRIPPER
+    closed, opened = _GRIPPER_JOINT
+    return turned(actions, lambda value: (value * (high - low) + low - closed) / (opened - closed))
+
+
+def gripper_to_angle(position: np.ndarray, scale: tuple[float, float] = _PI_GRIPPER) -> np.ndarray:
     """The robot's gripper state (0 closed, 1 open, linear in position) in the base models' scale (linear in angle)."""
     closed, opened = _GRIPPER_POSITION
     length = position * (opened - closed) + closed
     with np.errstate(divide="ignore", over="ignore"):  # far outside the gripper's range; clipped below
         sine = (_HORN**2 + length**2 - _ARM**2) / (2 * _HORN * length)
-    low, high = _PI_GRIPPER
+    low, high = scale
     return np.asarray((np.arcsin(np.minimum(np.maximum(sine, -1.0), 1.0)) - low) / (high - low))
 
 

@@ -325,7 +325,7 @@ class PolicyCalls:
             seconds = time.perf_counter() - started
             run = next(self._run_numbers)
             each = zip(answers, arguments, strict=True)
-            return [_checked(Result(seconds, batch=rows, run=run), answer, one) for answer, one in each]
+            return [_checked(Result(seconds, batch=rows, run=run, began=started), answer, one) for answer, one in each]
         except DeviceLost as error:
             self._on_lost(str(error))
             return [Result(time.perf_counter() - started, error="lost", text=str(error))] * rows
@@ -369,7 +369,7 @@ class PolicyCalls:
 
         try:
             answer = infer()
-            return _checked(Result(seconds(), run=next(self._run_numbers)), answer, arguments)
+            return _checked(Result(seconds(), run=next(self._run_numbers), began=started), answer, arguments)
         except ObservationError as error:
             return Result(seconds(), error="observation", text=str(error))
         except ActionError as error:
@@ -435,7 +435,9 @@ def _checked(result: Result, answer: Any, arguments: Mapping[str, Any]) -> Resul
         return replace(result, answer=answer)
     try:
         checked = checked_answer(answer, model_actions=bool(arguments.get("model_actions")))
-        return Result(result.seconds, checked, batch=result.batch, run=result.run)  # sooner than `replace`
+        return Result(
+            result.seconds, checked, None, "", result.batch, result.run, result.began
+        )  # not `replace`: slower
     except ActionError as error:
         return replace(result, error="actions", text=str(error))
 

@@ -43,6 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {  # a request's keys behind "turbopi/", wh
         "description": "B observations in one request: each value of the observation is a list of B",
     },
     "robot": _TEXT,
+    "traceparent": _TEXT,
 }
 
 

@@ -1,5 +1,6 @@
 """A server's options: defined once, for `turbopi serve`, `serve.run`, `serve.running` and PolicyServer."""
 
+import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
 MAX_BATCH = 64
 MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever
 MAX_CONTROL_HZ = 10_000.0
+OPENTELEMETRY = ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http")  # of the extra `otel`
 JOINING = ("rtc", "rtc_identity", "rtc_trained")
 
 
@@ -43,6 +45,7 @@ class ServerOptions:
     execution_horizon
                     s, actions of a chunk that robots carry out before the next takes over. None: half of a chunk
     delay_steps     control steps from an observation to its chunk at the robot. None: measured here, network apart
+    traces          spans of each call to OpenTelemetry (traces.py)
     """
 
     host: str = "127.0.0.1"
@@ -62,6 +65,7 @@ class ServerOptions:
     control_hz: float | None = None
     execution_horizon: int | None = None
     delay_steps: int | None = None
+    traces: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
@@ -93,6 +97,8 @@ class ServerOptions:
             raise ConfigError("record_limit= and record_images= are of a recording: give record_dir=, too")
         if self.record_dir is not None:
             self._check_recording()
+        if self.traces:
+            _check_traces()
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
 
@@ -109,6 +115,17 @@ class ServerOptions:
     def has_page(self) -> bool:
         """Whether the page is on."""
         return self.page if self.page is not None else self.host in LOOPBACK or self.api_key is not None
+
+
+def _check_traces() -> None:
+    """Raise ConfigError if a package that traces need is missing: before a policy is loaded, not after."""
+    for name in OPENTELEMETRY:
+        try:
+            found = importlib.util.find_spec(name)
+        except ModuleNotFoundError:
+            found = None
+        if found is None:
+            raise ConfigError(f"traces need OpenTelemetry, and {name} isn't installed: pip install 'turbopi[otel]'")
 
 
 def check_key(api_key: str | None) -> None:

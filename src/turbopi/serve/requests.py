@@ -9,6 +9,7 @@ docs/dev/request.md follows one observation all the way; docs/serving_sessions.m
 """
 
 import asyncio
+import re
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -44,6 +45,7 @@ from turbopi.support.errors import ObservationError
 MAX_BATCH_ROWS = 1024  # B of one batch message
 LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
 TIMING = "policy_timing"
+_TRACEPARENT = re.compile(r"[0-9a-f]{2}-[0-9a-f]{32}-[0-9a-f]{16}-[0-9a-f]{2}")
 REFUSALS = {  # texts by kind of error; all others are sent as they are
     "observation": "bad observation: {}",
     "actions": "bad actions: {}",
@@ -64,6 +66,7 @@ class Result:
     seconds  in the policy
     batch    observations in its run
     run      the run's number: observations of one run share it
+    began    when its run began, in time.perf_counter(); 0: it had none in this process, or failed
     """
 
     seconds: float
@@ -72,6 +75,7 @@ class Result:
     text: str = ""
     batch: int = 1
     run: int = 0
+    began: float = 0.0
 
 
 STOPPING = Result(0.0, error="stopping", text="the server is shutting down")
@@ -164,8 +168,9 @@ class PolicyFailed(Exception):
 class ClientRequest:
     """A message that was read: what to run (`plan`), when (`scheduling`), and for whom.
 
-    results  once it is submitted
-    reply    once it is made on the policy's thread
+    results    once it is submitted
+    submitted  when that was, in time.perf_counter()
+    reply      once it is made on the policy's thread
     """
 
     plan: Plan
@@ -173,6 +178,7 @@ class ClientRequest:
     connection: GuardedConnection
     arrived: float
     results: "asyncio.Future[list[Result]] | None" = None
+    submitted: float = 0.0
     reply: Reply | None = None
 
     def scheduled(self, rows: int = 1, remaining: int = 0) -> Request:
@@ -249,6 +255,7 @@ class RequestHandler:
             return Refusal("malformed", f"bad request: {error}")
         except ObservationError as error:
             return Refusal("observation", REFUSALS["observation"].format(error))
+        request.submitted = time.perf_counter()
         request.results = self._submit(request)
         return request
 
@@ -478,12 +485,15 @@ class SchedulingOptions:
               for which nothing is refused
     priority  robots come before simulators
     batch     B of a batch message; None: one observation, without a batch axis
+    traceparent
+              of the client's own trace (W3C Trace Context); empty if it gives none
     """
 
     deadline: float
     firm: bool = False
     priority: Priority = "robot"
     batch: int | None = None
+    traceparent: str = ""
 
 
 def read_robot(received: Mapping[str, Any]) -> str:
@@ -508,7 +518,18 @@ def read_scheduling(
     if not isinstance(priority, str) or priority not in PRIORITIES:
         raise ObservationError(f"{PREFIX}priority is {priority!r:.100}; it should be one of {', '.join(PRIORITIES)}")
     deadline = _deadline(given, control_hz)
-    return SchedulingOptions(default_ms / 1e3 if deadline is None else deadline, deadline is not None, priority, batch)
+    seconds = default_ms / 1e3 if deadline is None else deadline
+    return SchedulingOptions(seconds, deadline is not None, priority, batch, _traceparent(given))
+
+
+def _traceparent(given: Mapping[str, Any]) -> str:
+    value = given.get("traceparent", "")
+    if not isinstance(value, str) or ("traceparent" in given and not _TRACEPARENT.fullmatch(value)):
+        raise ObservationError(
+            f"{PREFIX}traceparent is {value!r:.100}; it should be as in W3C's Trace Context, such as "
+            "'00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01'"
+        )
+    return value
 
 
 def _deadline(given: Mapping[str, Any], control_hz: float | None) -> float | None:

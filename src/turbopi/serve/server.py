@@ -60,6 +60,7 @@ from turbopi.serve.requests import (
     batch_row,
 )
 from turbopi.serve.signals import stop_signals
+from turbopi.serve.traces import Traces
 from turbopi.support.errors import ConfigError, DeviceLost
 
 logger = logging.getLogger(__name__)
@@ -135,6 +136,7 @@ class PolicyServer:
         )
         self.metrics.watch(lambda: self._calls.waiting, lambda: self._calls.running)
         self._live = Live(self.metrics, self._calls, lambda: self.lost) if options.has_page else None
+        self._traces: Traces | None = None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
         self._uncounted: list[Callable[[], None]] = []
@@ -172,6 +174,8 @@ class PolicyServer:
         if self._started:
             raise RuntimeError("a PolicyServer starts once: make a new one")
         self._started = True
+        if self.options.traces:
+            self._traces = Traces(self._log)
         try:
             self.port = await self._listener.bind(self.host, self.port)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that can't be a name
@@ -202,6 +206,8 @@ class PolicyServer:
             self._calls.close()
             if self._recorder is not None:
                 self._recorder.close()
+            if self._traces is not None:
+                await self._traces.close()
             raise
 
     def _cannot_listen(self, error: Exception) -> ConfigError:
@@ -231,6 +237,8 @@ class PolicyServer:
         self._gate.flush_log()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
+        if self._traces is not None:
+            await self._traces.close()
 
     async def __aenter__(self) -> "PolicyServer":
         await self.start()
@@ -335,7 +343,7 @@ class PolicyServer:
         self._count()  # in the order in which it happened
         self.metrics.error("policy")
         if self._live is not None:
-            self._live.refused(connection, "policy", text.strip().rpartition("\n")[2])  # what was raised
+            self._live.refused(connection, "policy", _raised(text))
         with contextlib.suppress(ConnectionClosed):
             await connection.send(text)
             await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
@@ -348,9 +356,14 @@ class PolicyServer:
         while not self._stopping:
             started = time.perf_counter()
             message, received, begun = await self._next(connection)
-            reply = begun if isinstance(begun, Refusal) else await self._requests.finish(begun)
+            try:
+                reply = begun if isinstance(begun, Refusal) else await self._requests.finish(begun)
+            except PolicyFailed as failure:
+                self._trace_refusal(connection, begun, Refusal("policy", _raised(str(failure))), received)
+                raise
             if isinstance(reply, Refusal):
                 await self._refuse(connection, reply)
+                self._trace_refusal(connection, begun, reply, received)
                 continue
             if reply.sent is None:
                 await connection.send(pack(reply.result))
@@ -360,8 +373,8 @@ class PolicyServer:
                     await connection.drain()
                 finished = reply.sent
             connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
-            assert not isinstance(message, str)
-            self._count_later(connection, message, reply, received, finished)
+            assert isinstance(begun, ClientRequest) and not isinstance(message, str)
+            self._count_later(connection, message, begun, reply, finished)
             del message, begun, reply  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
@@ -370,14 +383,14 @@ class PolicyServer:
         self,
         connection: GuardedConnection,
         message: bytes | memoryview,
+        request: ClientRequest,
         reply: Reply,
-        received: float,
         finished: float,
     ) -> None:
         """Count an answer after COUNT_SECONDS, or now if its message takes much memory."""
         if self._live is not None and self._live.watched:
             message = bytes(message)  # now: what comes next may be written over it
-        self._uncounted.append(partial(self._count_answer, connection, message, reply, received, finished))
+        self._uncounted.append(partial(self._count_answer, connection, message, request, reply, finished))
         if len(message) > self._limits.free_bytes:
             self._count()
         elif len(self._uncounted) == 1:
@@ -396,14 +409,16 @@ class PolicyServer:
         self,
         connection: GuardedConnection,
         message: bytes | memoryview,
+        request: ClientRequest,
         reply: Reply,
-        received: float,
         finished: float,
     ) -> None:
-        scheduling = reply.scheduling
-        self.metrics.request_seconds.observe(finished - received)
+        scheduling, seconds = reply.scheduling, finished - request.arrived
+        self.metrics.request_seconds.observe(seconds)
+        if self._traces is not None:
+            self._traces.answered(connection, request, reply.result, finished)
         if scheduling.firm:
-            self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
+            self.metrics.slack(scheduling.deadline - seconds, scheduling.priority)
         for note in reply.notes:
             self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
             if self._live is not None:
@@ -411,7 +426,7 @@ class PolicyServer:
         if "actions" not in reply.result:  # a policy with memory has recorded the observation alone
             return
         if self._live is not None:
-            self._live.answered(connection, message, reply, finished - received)
+            self._live.answered(connection, message, reply, seconds)
         if self._recorder is not None:
             self._record(bytes(message), reply.result, scheduling.batch)
 
@@ -471,6 +486,11 @@ class PolicyServer:
             self._log.warning(f"{peer(connection)}: {reason}, the last one: {text}", "flood")
             await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
+    def _trace_refusal(self, connection: GuardedConnection, begun: Begun, refusal: Refusal, received: float) -> None:
+        if self._traces is not None:
+            request = begun if isinstance(begun, ClientRequest) else None
+            self._traces.refused(connection, request, refusal, received)
+
     def _record(self, message: bytes, result: dict[str, object], batch: int | None) -> None:
         """Record a call; of a batch message each row, as a call of its own."""
         assert self._recorder is not None
@@ -480,6 +500,11 @@ class PolicyServer:
             return
         for index in range(batch):
             self._recorder.put(batch_row(observation, index), batch_row(result, index), size=len(message) // batch)
+
+
+def _raised(text: str) -> str:
+    """What was raised, of a traceback."""
+    return text.strip().rpartition("\n")[2]
 
 
 def _set_aside_what_stays() -> None:

@@ -19,18 +19,20 @@ from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lerobot_policy_turbopi import real_time
 from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiConfig
 from lerobot_policy_turbopi.real_time import Join, read_join
 from lerobot_policy_turbopi.server import PROCESSORS, ServedModel
 from turbopi import UnifiedPolicy, open_checkpoint
-from turbopi.config import memory_of
+from turbopi.config import empty_cameras, memory_of
 from turbopi.models import family_of
 from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy.call_options import checked_steps
 from turbopi.policy.history import ObservationHistory
 from turbopi.preprocess.images import fit_unit
+from turbopi.robots.aloha import smolvla_actions, smolvla_state
 from turbopi.support.errors import ActionError, CheckpointError, ConfigError, ObservationError
 from turbopi.support.reading import file_inside, read_json
 
@@ -222,6 +224,8 @@ class TurboPiPolicy(PreTrainedPolicy):
             joined["conditioning"] = [join.conditioning(row, steps, *shape[1:]) for row in range(shape[0])]
         with torch.inference_mode(False):  # buffers made inside it would be of no use outside
             actions = self._local.backend.sample(inputs, noise, steps, **joined).actions
+        if self._local.config.turns_aloha:
+            actions = torch.from_numpy(smolvla_actions(actions.cpu().numpy()))
         if not actions.isfinite().all():
             raise ActionError("the model computed actions that aren't finite; `turbopi verify` compares backends")
         return actions[..., : self.config.output_features[ACTION].shape[0]].to(device)
@@ -231,9 +235,12 @@ class TurboPiPolicy(PreTrainedPolicy):
             if key not in batch:
                 raise ObservationError(f"the batch has no {key!r}; it has {', '.join(batch)}. Preprocess it first")
         tokens, camera_images = batch[OBS_LANGUAGE_TOKENS], self._images(batch)
+        # What is missing isn't sent at all, but for images that have tokens around them
+        mask = torch.ones(camera_images.shape[:2], dtype=torch.bool)
+        masked = min(len(self.config.image_features) - mask.shape[1], empty_cameras(self._local.config.model))
         inputs = Observation(
-            images=camera_images,
-            image_mask=torch.ones(camera_images.shape[:2], dtype=torch.bool),  # what is missing isn't sent at all
+            images=pad(camera_images, (0,) * 7 + (masked,)),
+            image_mask=pad(mask, (0, masked)),
             tokens=tokens,
             token_mask=batch[OBS_LANGUAGE_ATTENTION_MASK].bool(),
             state=self._state(batch, len(tokens)),
@@ -294,6 +301,8 @@ class TurboPiPolicy(PreTrainedPolicy):
         state = torch.zeros(rows, self.config.max_action_dim if family.planned else model.state_dim)
         if family.reads_state:
             given = batch[OBS_STATE]
+            if self._local.config.turns_aloha:
+                given = torch.from_numpy(smolvla_state(given.cpu().numpy()))
             state[:, : given.shape[-1]] = given
         return state
 

@@ -49,6 +49,7 @@ class SmolVLAConfig:
     self_every        every so many-th layer's expert attends to prefix and suffix, the others across to the prefix
                       alone; 0: all across. None: attention_mode isn't "cross_attn", all attend to both
     image_start, end  ids of tokens around each image, with `add_image_special_tokens`
+    empty_cameras     images that are always masked, beside the tokens around them, which aren't; 0 without such tokens
     min_prefix        places of a shorter prefix are filled up with masked zeros (prefix_length)
     """
 
@@ -68,6 +69,7 @@ class SmolVLAConfig:
     max_period: float = 4.0
     image_start: tuple[int, ...] = ()
     image_end: tuple[int, ...] = ()
+    empty_cameras: int = 0
     min_prefix: int = -1
     element_types: ElementTypes = ElementTypes()
 
@@ -172,6 +174,7 @@ def from_lerobot(config: Mapping[str, Any], vlm: Mapping[str, Any]) -> SmolVLACo
         min_prefix=config.get("prefix_length", -1),
         image_start=tuple(vlm.get("image_start_token_ids", (49_189, 49_152))) if special else (),
         image_end=tuple(vlm.get("image_end_token_ids", (49_189,))) if special else (),
+        empty_cameras=config.get("empty_cameras", 0) if special else 0,
         element_types=ElementTypes("bfloat16", "bfloat16") if loaded else ElementTypes("float32", stored),
     )
 

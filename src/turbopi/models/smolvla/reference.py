@@ -311,8 +311,7 @@ class SmolVLAModel(nn.Module):
                 x = layer.finish(x, self.attend(q, keys[-1], values[-1], mask))
         return torch.stack(keys), torch.stack(values), positions
 
-    @staticmethod
-    def compacted(observation: Observation) -> Observation:
+    def compacted(self, observation: Observation) -> Observation:
         """Without cameras and places of the prompt that no row needs; reading the masks waits for the device.
 
         A masked place takes no position and nothing attends to it, so leaving it out is exact.
@@ -321,7 +320,7 @@ class SmolVLAModel(nn.Module):
         """
         if not bool(observation.image_mask.any(1).all()):
             raise ObservationError("SmolVLA needs an image of one camera at least, and an observation has none")
-        cameras = observation.image_mask.any(0).nonzero().squeeze(1)
+        cameras = self._with_tokens(observation).any(0).nonzero().squeeze(1)
         places = observation.token_mask.any(0).nonzero().squeeze(1)
         return Observation(
             observation.images[:, cameras],
@@ -330,6 +329,14 @@ class SmolVLAModel(nn.Module):
             observation.token_mask[:, places],
             observation.state,
         )
+
+    def _with_tokens(self, observation: Observation) -> Tensor:
+        """bool[B, C], cameras whose images have their tokens around them, if the model has such tokens: those that are
+        there, and `empty_cameras` of the others, the last ones.
+        """
+        there = observation.image_mask
+        others_from_here = (~there).flip(1).cumsum(1).flip(1)
+        return there | (others_from_here <= self.config.empty_cameras)
 
     def embed_images(self, images: Tensor) -> Tensor:
         """(uint8 | float32 in [-1, 1]) [N, h, w, 3] -> [N, T, D]: SigLIP, pixel shuffle and connector, unscaled."""
@@ -343,7 +350,7 @@ class SmolVLAModel(nn.Module):
         batch, cameras = observation.image_mask.shape
         parts: list[Tensor] = []
         valid: list[Tensor] = []
-        everywhere = observation.token_mask.new_ones
+        everywhere, around = observation.token_mask.new_ones, self._with_tokens(observation)
         if embedded is None:
             embedded = self.embed_images(observation.images.transpose(0, 1).flatten(0, 1))
         if trace is not None:
@@ -354,7 +361,7 @@ class SmolVLAModel(nn.Module):
                 if ids:
                     special = torch.tensor(ids, device=its.device)
                     parts.append(self.vlm.embed_tokens(special).expand(batch, -1, -1))
-                    valid.append(everywhere(batch, len(ids)))
+                    valid.append(around[:, camera, None].expand(-1, len(ids)))
                 if images is not None:
                     parts.append(images)
                     valid.append(observation.image_mask[:, camera, None].expand(-1, images.shape[1]))

@@ -165,7 +165,8 @@ class RemoteCalls:
         self._metrics.inference_seconds.observe(result.seconds)
         self._metrics.queue_seconds.observe(max(0.0, total - result.seconds))
         self._metrics.batch_size.observe(result.batch)
-        return replace(result, run=hash((answer.replica, result.run)))  # replicas count their runs for themselves
+        # Replicas count their runs for themselves, and have clocks of their own.
+        return replace(result, run=hash((answer.replica, result.run)), began=0.0)
 
     def _lost(self, requested: float, text: str) -> Result:
         return Result(time.perf_counter() - requested, error="replica", text=text)

@@ -1,0 +1,1 @@
+"""Other programs beside Turbo-Pi, on one GPU and in one run: `python -m peers --help`."""
