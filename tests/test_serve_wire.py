@@ -73,7 +73,7 @@ def test_bytes_are_those_of_openpi(name: str) -> None:
 
 def test_arrays_are_written_as_msgpack_itself_writes_their_maps() -> None:
     image = np.arange(2**17, dtype=np.uint8).reshape(64, 2, -1)
-    arrays = [np.zeros(size, np.uint8) for size in (0, 1, 255, 256, 2**16 - 1, 2**16)]
+    arrays: list[np.ndarray] = [np.zeros(size, np.uint8) for size in (0, 1, 255, 256, 2**16 - 1, 2**16)]
     arrays += [image, image[::2], image.T, np.float32(1) * image[0], np.array(2.5), np.array(["é", "ab"])]
     arrays += [np.array([True]), np.array([1], ">i2"), np.zeros((2, 0, 3)), np.array(["2026-11-29"], "M8[D]")]
     deep: dict[str, Any] = {"array": image}

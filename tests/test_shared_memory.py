@@ -116,7 +116,7 @@ def test_a_policy_that_keeps_no_image_reads_them_where_they_lie_but_for_a_record
             client.infer(observation("six", seed))
         assert client._socket is not None and client._socket._memory is not None
         memory = client._socket._memory._memory
-        policy.before = lambda: memory.seek(BEGIN) or memory.write(bytes(len(memory) - BEGIN))
+        policy.before = lambda: memory.__setitem__(slice(BEGIN, None), bytes(len(memory) - BEGIN))
         wait_for(lambda: bool(server._idle))  # a request that comes sooner is copied
         client.infer(observation("six", 1))
     image = observation("six", 1)["observation/image"]
