@@ -147,9 +147,9 @@ CANNOT = "was asked for, which this policy can't: it offers"
     [
         (
             ["--execution", "rtc_trained", "--control-hz", "50"],
-            f"--execution rtc_trained {CANNOT} ['rtc', 'rtc_identity']. That mode is for checkpoints that were trained",
+            f"--execution rtc_trained {CANNOT} ['rtc', 'rtc_identity', 'warm_start']. That mode is for checkpoints",
         ),
-        ([*RTC, "--solver", "heun", "--steps", "6"], f"--execution rtc {CANNOT} none"),
+        ([*RTC, "--solver", "heun", "--steps", "6"], f"--execution rtc {CANNOT} ['warm_start']"),
         (
             [*RTC, "--max-batch", "4", "--backend", "pytorch"],
             "--max-batch 4 was asked for, but this policy runs requests",
@@ -188,7 +188,7 @@ def test_what_backends_for_gpus_offer_is_known_without_one(monkeypatch: pytest.M
         for name in ("fused", "cuda_graph", "tensorrt", "tensorrt_pipelined")
         if (options := PolicyOptions(random_weights="pi05_tiny", backend=name, device="cpu"))
     }
-    modes = ("rtc", "rtc_identity")
+    modes = ("rtc", "rtc_identity", "warm_start")
     assert {name: one.batch_modes for name, one in found.items() if one.batch_modes} == {
         "fused": modes,
         "cuda_graph": modes,

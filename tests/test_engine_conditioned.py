@@ -182,4 +182,4 @@ def test_too_many_times_are_refused() -> None:
 
 
 def test_backends_say_which_forms_they_have() -> None:
-    assert set(on_cpu().forms) == {"solver", "tokens", "jacobian"}
+    assert set(on_cpu().forms) == {"solver", "tokens", "jacobian", "two_prompts"}

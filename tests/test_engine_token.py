@@ -15,7 +15,8 @@ from turbopi.models.observation import Observation
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import token
-from turbopi.models.pi0_fast.reference import Decoding, Pi0FastModel, compacted
+from turbopi.models.pi0.decoding import Decoding
+from turbopi.models.pi0_fast.reference import Pi0FastModel, compacted
 
 pytestmark = gpu_or_interpreter()
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -76,6 +77,23 @@ def test_an_end_is_marked_and_the_first_of_equals_is_chosen(policy: UnifiedPolic
     equal = begun(policy, name, model, 0)
     token.TokenStep(model, token.JoinedWeights(model), equal)()
     assert int(equal.chosen) == 0
+
+
+@torch.no_grad()
+def test_a_token_of_text_has_its_own_head_and_leaves_out_ids(policy: UnifiedPolicy, name: str) -> None:
+    model: Pi0FastModel = policy.backend.model  # type: ignore[attr-defined]
+    head = torch.randn(model.head.shape, generator=torch.Generator().manual_seed(0)).to(model.head)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(model), "head", property(lambda self: head))
+        free, ours, theirs = (begun(policy, name, model, 1) for _ in range(3))
+        model.step(free)
+        best = int(free.chosen)
+        patch.setattr(type(model), "never", ((best, best + 1), (len(head), len(head) + 9)))
+        token.TokenStep(model, token.JoinedWeights(model), ours)()
+        model.step(theirs)
+        assert int(ours.chosen) == int(theirs.chosen) != best and torch.isneginf(ours.logits[:, best]).all()
+        there = torch.isfinite(theirs.logits)
+        assert (ours.logits - theirs.logits)[there].abs().max() <= 2e-5 * theirs.logits[there].abs().max()
 
 
 def test_other_sizes_are_refused_by_name() -> None:

@@ -40,7 +40,7 @@ class Model:
     """A policy's model that answers with the noise plus a number that counts its calls."""
 
     def __init__(self, kind: str = "pi05") -> None:
-        self.config = SimpleNamespace(model=SimpleNamespace(kind=kind))
+        self.config = SimpleNamespace(model=SimpleNamespace(kind=kind), turns_aloha=False)
         self.seen: list[tuple[Any, int]] = []
         self.backend = self
         self.metadata = {"real_time": {"modes": ["rtc", "rtc_identity"]}}

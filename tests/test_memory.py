@@ -20,7 +20,7 @@ from turbopi.models.observation import ModelInputs, Observation
 from turbopi.models.pi0.memory import frame_places
 from turbopi.models.pi0.reference import Trace
 from turbopi.policy.examples import prepared as examples_of
-from turbopi.policy.history import ObservationHistory
+from turbopi.policy.history import History
 from turbopi.replay.run import Replay
 from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError
 
@@ -44,7 +44,7 @@ def visual(policies: dict[str, UnifiedPolicy]) -> UnifiedPolicy:
     return policies["visual"]
 
 
-def prepared(policy: UnifiedPolicy, observation: dict[str, Any], history: ObservationHistory) -> ModelInputs:
+def prepared(policy: UnifiedPolicy, observation: dict[str, Any], history: History) -> ModelInputs:
     return policy._call.recorded(policy._call.see(observation), history)
 
 

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "turbopi"
-OTHER_FAMILIES = ("tests/golden_memory/", "tests/golden_pi0_fast/", "tests/golden_smolvla/")
+OTHER_FAMILIES = ("tests/golden_memory/", "tests/golden_pi0_fast/", "tests/golden_smolvla/", "tests/golden_text/")
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,10 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import Checkpoint, random_checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.config import RealTime
+from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.models.pi0.denoise import time_grid
+from turbopi.models.pi0.solvers import Integration
 from turbopi.policy.chunk_conditioning import ChunkConditioning
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import CheckpointError, ConfigError, ObservationError
@@ -221,9 +223,40 @@ def test_token_times_bring_their_number_of_steps(policy: UnifiedPolicy) -> None:
         policy.infer(observation, conditioning=requested, previous=RunningChunk(rows(8), 2))
 
 
+@pytest.mark.parametrize("how", [{}, {"solver": "ab2", "num_steps": 3}, {"time_grid": (1.0, 0.7, 0.2, 0.0)}], ids=str)
+def test_a_warm_start_begins_with_the_left_over_at_60_percent_noise(
+    policy: UnifiedPolicy, engine: UnifiedPolicy, how: dict[str, Any]
+) -> None:
+    """By every solver, alone and in batches, beside plain observations; without it noise is noise."""
+    observation, left_over = policy.example_observation(), rows(8)
+    joined = RunningChunk(left_over, 2, mode="warm_start")
+    found = policy.infer(observation, seed=4, previous=joined, **how)["actions"]
+    noise = np.random.default_rng(4).standard_normal((H, A), dtype=np.float32)
+    begun = np.float32(0.6) * noise + np.float32(0.4) * left_over[[*range(8), 7, 7]]
+    times = {"ab2": [1, 2 / 3, 1 / 3, 0]}.get(how.get("solver", ""), how.get("time_grid", [1, 0.5, 0]))
+    integration = Integration(how.get("solver", "euler"), tuple(0.6 * t for t in times))
+    inputs = Observation.stack([policy.prepare(observation)])
+    x_t, loop = torch.from_numpy(begun)[None], Conditioning(integration=integration)
+    exact = policy.backend.sample(inputs, x_t, integration.evaluations, conditioning=loop).actions[0]
+    np.testing.assert_allclose(found, policy.pipeline.after(exact.numpy(), np.zeros(8))["actions"], rtol=0, atol=1e-5)
+    both = engine.infer_batch([observation] * 2, seed=[4, 4], previous=[joined, None], **how)
+    np.testing.assert_allclose(both[0]["actions"], found, rtol=0, atol=1e-4)
+    plain = policy.infer(observation, seed=4, **how)["actions"]
+    np.testing.assert_allclose(both[1]["actions"], plain, rtol=0, atol=1e-4)
+    assert np.abs(found - plain).max() > 1e-3
+
+
+def test_weights_of_one_step_have_no_warm_start(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    one_step = dataclasses.replace(policy.config, one_step=True)
+    monkeypatch.setattr(policy._conditioning, "_config", one_step)
+    assert "warm_start" not in policy.metadata["real_time"]["modes"]
+    with pytest.raises(ObservationError, match="distilled for one step from noise alone"):
+        policy.infer(policy.example_observation(), previous=RunningChunk(rows(8), 2, mode="warm_start"))
+
+
 def test_metadata_says_what_can_be_joined(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
     said = policy.metadata["real_time"]
-    assert said["modes"] == ["rtc", "rtc_identity", "rtc_trained"] and said["trained_max_delay"] == 3
+    assert said["modes"] == ["rtc", "rtc_identity", "rtc_trained", "warm_start"] and said["trained_max_delay"] == 3
     monkeypatch.setattr(type(policy.backend), "forms", ("tokens",))
     assert policy.metadata["real_time"]["modes"] == ["rtc_identity", "rtc_trained"]
 
@@ -461,7 +494,7 @@ def test_warm_up_captures_batches_of_each_mode(engine: UnifiedPolicy, monkeypatc
     forms = [None if one is None else one.form for *_, one in requested]
     assert forms == [None, "jacobian", "tokens"] and {rest[:2] for rest in requested} == {(2, H)}
     assert all(rest[2] == [1, 4] for rest in requested)
-    assert engine.batch_modes == ("rtc", "rtc_identity", "rtc_trained")
+    assert engine.batch_modes == ("rtc", "rtc_identity", "rtc_trained", "warm_start")
 
 
 def test_a_backend_that_runs_observations_one_by_one_has_no_modes_for_batches(policy: UnifiedPolicy) -> None:

@@ -153,7 +153,7 @@ def test_chunks_join_by_eulers_steps_on_any_grid_and_other_solvers_refuse(
     by_hand = policy.infer(observation, seed=0, conditioning=Conditioning(times, guidance=pull))
     np.testing.assert_array_equal(found, by_hand["actions"])
     ab2 = made(tiny, solver="ab2")
-    assert ab2.metadata["real_time"]["modes"] == [] and own.metadata["real_time"]["modes"]
+    assert ab2.metadata["real_time"]["modes"] == ["warm_start"] and own.metadata["real_time"]["modes"]
     with pytest.raises(ObservationError, match=r"a running chunk and solver 'ab2' were both given.*solver 'euler'"):
         ab2.infer(observation, previous=previous)
     ab2.infer(observation, previous=previous, solver="euler")

@@ -18,6 +18,7 @@ from turbopi.support.reading import is_finite, is_integer, shown
 PiKind = Literal["pi05", "pi0"]
 Kind = Literal["pi05", "pi0", "pi0_fast", "smolvla"]
 WITH_MEMORY: tuple[Kind, ...] = ("pi05",)  # LeRobot has `MemoryConfig` in it alone
+WITH_TEXT: tuple[Kind, ...] = ("pi05",)  # what may have `TextConfig`
 FloatPrecision = Literal["bf16", "f32"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 
@@ -43,6 +44,7 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
     "temporal_every": 256,
     "state_dim": 1024,
 }
+MOST_GUIDANCE = 100.0  # scale of guidance by a prompt's tag; 1.5 to 2.5 are in use
 MOST_REMEMBERED = 2048  # observations of an episode that a policy with memory keeps: 1.2 GB for each camera
 
 
@@ -316,6 +318,45 @@ class RealTime:
 
 
 @dataclass(frozen=True)
+class Subtasks:
+    """A policy that writes what it does next, and acts on that: LeRobot's pi052.
+
+    chunks  of actions that are made of one subtask before the next is written
+    joint   actions see the prompt, and behind it the subtask, each token of which sees what is before it; else the
+            subtask in place of the prompt
+    """
+
+    chunks: int = 1
+    joint: bool = False
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """Text that a Pi0.5 writes with its language head, greedily (docs/text.md).
+
+    template     what it continues, with {prompt} and, if it was trained so, {state}: the state's numbers
+    max_tokens   of an answer at most
+    trained      whether the head was; otherwise nothing is written
+    skipped_ids  LeRobot's fast_skip_tokens: action tokens, and locations, are never written. None: any id may be
+    subtasks     actions are made of what was written; None: of the prompt
+    """
+
+    template: str
+    max_tokens: int = 128
+    trained: bool = True
+    skipped_ids: int | None = None
+    subtasks: Subtasks | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a template without the prompt, and for a number that can't be."""
+        if "{prompt}" not in self.template:
+            raise ConfigError(f"the template of text is {shown(self.template)}; expected a text with {{prompt}} in it")
+        if not (is_integer(self.max_tokens) and 1 <= self.max_tokens <= LIMITS["max_decoding_steps"]):
+            limit = LIMITS["max_decoding_steps"]
+            raise ConfigError(f"max_tokens of text is {shown(self.max_tokens)}; expected a whole number, 1 to {limit}")
+
+
+@dataclass(frozen=True)
 class PolicyConfig:
     """A model and its robot: everything `UnifiedPolicy` needs besides weights, statistics and a tokenizer."""
 
@@ -333,10 +374,17 @@ class PolicyConfig:
     num_denoising_steps: int = 10  # the default of a call; so are the next two
     solver: Solver = "euler"
     solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
+    one_step: bool = False  # distilled for one denoising step: no other number makes its actions
     real_time: RealTime = RealTime()
     missing_cameras: MissingCameras = "masked"  # "black": seen as black images, as by openpi's Pi0-FAST
     prompt_labels: bool = False  # without a state, it still is "Task: ...;\nAction: ": LeRobot's Pi0.5 trained so
     turns_aloha: bool = False  # normalised joints of ALOHA are turned: LeRobot's SmolVLA with adapt_to_pi_aloha
+    text: TextConfig | None = None  # what it writes; None: nothing says that its language head was trained
+
+    @property
+    def writes_subtasks(self) -> bool:
+        """Whether it writes the subtasks that its actions are made of."""
+        return self.text is not None and self.text.trained and self.text.subtasks is not None
 
     @property
     def planned_model(self) -> ModelConfig:

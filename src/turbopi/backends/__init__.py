@@ -50,6 +50,7 @@ class BackendSpec:
     extension  of another distribution's
     unplanned  "module:class" that runs under this name what the engine has no plan for
     tokens     "module:class" that runs under this name models that write their actions as tokens
+    text       "module:class" that runs under this name a Pi0.5 that writes the subtasks it acts on
     """
 
     name: str
@@ -59,6 +60,7 @@ class BackendSpec:
     extension: extensions.Extension | None = None
     unplanned: str | None = None
     tokens: str | None = None
+    text: str | None = None
 
 
 _SPECS = (
@@ -82,6 +84,7 @@ _SPECS = (
         "the whole call in CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
         unplanned="turbopi.backends.captured:CapturedBackend",
         tokens="turbopi.backends.tokens:CapturedTokensBackend",
+        text="turbopi.backends.captured_text:CapturedTextBackend",
     ),
     BackendSpec(
         "fused",
@@ -187,8 +190,17 @@ def _unavailable(cls: type[Backend], device: torch.device) -> str | None:
         return f"its check of the device failed: {extensions.reason(error)}"
 
 
-def choose(device: torch.device, precision: Precision = "bf16", model: Network | None = None) -> tuple[str, str]:
-    """The backend that "auto" stands for on a device in a precision, and why. model: None: one of Pi0 or Pi0.5."""
+def choose(
+    device: torch.device, precision: Precision = "bf16", model: Network | None = None, *, writes: bool = False
+) -> tuple[str, str]:
+    """The backend that "auto" stands for on a device in a precision, and why.
+
+    model   None: one of Pi0 or Pi0.5
+    writes  as `class_for`
+    """
+    if writes and precision not in TIERS:
+        captured = availability("cuda_graph", device) is None
+        return "cuda_graph" if captured else "pytorch", "auto: the fastest backend that writes subtasks"
     if precision in TIERS:
         untried = _untried(device, precision, model) if device.type == "cuda" else None
         return "fused", f"auto: the fast one of those that run in {precision}" + (f"; {untried}" if untried else "")
@@ -230,12 +242,19 @@ def _untried(device: torch.device, precision: Precision, model: Network | None) 
     return f"tested on this GPU: {verdict.summary}"
 
 
-def qualified(device: torch.device, precision: Precision, model: Network, *, bar: bool = False) -> None:
+def qualified(
+    device: torch.device, precision: Precision, model: Network, *, bar: bool = False, writes: bool = False
+) -> None:
     """Where "auto" could take `fused` on a GPU that Turbo-Pi's tests never ran on, find out once whether it should.
 
     Raises BackendUnavailable where `fused` fails in a precision that no other backend has.
     """
-    if device.type != "cuda" or is_known(device) or refusal("fused", device, precision, model) is not None:
+    if (
+        (writes and precision not in TIERS)
+        or device.type != "cuda"
+        or is_known(device)
+        or refusal("fused", device, precision, model) is not None
+    ):
         return
     verdict = verdict_of(device, precision, model)
     if verdict is None or 0 < verdict.unfinished < qualifying.TURNS:
@@ -297,13 +316,15 @@ def create(
     device: torch.device,
     precision: Precision,
     quantization: Quantization | None = None,
+    writes: bool = False,
 ) -> Backend:
     """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises.
 
     quantization   for FP8 and INT8 alone: the calibration of this very checkpoint
+    writes         as `class_for`
     """
     check(name, device, precision)
-    cls = class_for(name, config)
+    cls = class_for(name, config, writes=writes)
     if (why := cls.refuses_model(config)) is not None:
         raise BackendUnavailable(why)
     if (why := _refuses(cls, config, precision)) is not None:
@@ -328,14 +349,19 @@ def class_of(name: str) -> type[Backend]:
     return cls
 
 
-def class_for(name: str, config: Network) -> type[Backend]:
-    """`class_of`, or the one that runs under that name what the engine has no plan for, or what writes tokens."""
+def class_for(name: str, config: Network, *, writes: bool = False) -> type[Backend]:
+    """`class_of`, or the one that runs under that name what the engine has no plan for, or what writes tokens.
+
+    writes  a Pi0.5 that writes the subtasks it acts on
+    """
     spec, cls = BACKENDS.get(name), class_of(name)
     if spec is None:
         return cls
     place = spec.unplanned if cls.refuses_model(config) is not None else None
     if family_of(config).reader is not None:
         place = spec.tokens
+    if writes and spec.text is not None:
+        place = spec.text
     if place is None:
         return cls
     module, _, other = place.partition(":")

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from turbopi.checkpoint.base import Room
-from turbopi.config import FloatPrecision, ImageResize, Network
+from turbopi.config import FloatPrecision, ImageResize, Network, TextConfig
 from turbopi.models import family_of
 from turbopi.models.family import AnswerReader
-from turbopi.models.observation import Observation
+from turbopi.models.observation import Observation, SeenObservation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Trace
@@ -51,6 +51,16 @@ class BegunBatch(Protocol):
         """
 
 
+class TextWriting(Protocol):
+    """What a backend that writes text has: models/pi0/text.py's `TextWriter`, or the same in graphs."""
+
+    def see(self, observation: Observation) -> SeenObservation:
+        """One observation, on the host, with its images embedded: for `write`, and for the actions behind it."""
+
+    def write(self, observation: Observation, most: int) -> tuple[list[int], Any]:
+        """The ids behind its prompt, to EOS, which is the last one, or `most` of them; and more."""
+
+
 class Backend(ABC):
     """All backends compute what the reference of the model's family computes (`models.family_of`).
 
@@ -67,6 +77,7 @@ class Backend(ABC):
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
     reader          of a model that writes its actions as tokens: what makes actions of them. Set by the policy
+    writes, writer  whether it has `prepare_text`; what writes text, once that was called
     """
 
     name: ClassVar[str]
@@ -76,8 +87,10 @@ class Backend(ABC):
     begins: ClassVar[bool] = False
     runs_batches: ClassVar[bool] = False
     submits: ClassVar[bool] = False
+    writes: ClassVar[bool] = False
     strict = False
     reader: AnswerReader | None = None
+    writer: TextWriting | None = None
 
     config: Any  # a Network; a backend that plans says `ModelConfig`
 
@@ -138,6 +151,16 @@ class Backend(ABC):
                 f"backend {cls.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
                 "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
             )
+        if form == "two_prompts":
+            return (
+                f"backend {cls.name!r} has no guidance by a second prompt; take backend 'fused', 'cuda_graph' or "
+                "'pytorch', or guidance 1, which is the prompt with its tag alone, or 0, which is the one without"
+            )
+        if form == "two_prompts_jacobian":
+            return (
+                f"backend {cls.name!r} has no guidance by the true Jacobian (rtc) together with guidance by a second "
+                "prompt; take mode rtc_identity or rtc_trained, guidance 1 or 0, or backend 'pytorch'"
+            )
         what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
         return (
             f"backend {cls.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
@@ -158,6 +181,13 @@ class Backend(ABC):
             f"backend {self.name!r} has engines for the config's action horizon of {self.config.action_horizon}, not "
             f"for {horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
         )
+
+    def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
+        """Make `writer` around a Pi0.5's language model.
+
+        head  [V, D]; None: the embedding table is the head
+        """
+        raise self._lacks("text", "take backend 'pytorch'")
 
     # -- before calls --------------------------------------------------------------------------------------------------
 

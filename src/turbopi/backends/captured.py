@@ -91,6 +91,7 @@ class CapturedBackend(PyTorchBackend):
     name: ClassVar[str] = "cuda_graph"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens")
+    writes: ClassVar[bool] = False
     begins: ClassVar[bool] = True
 
     @classmethod
@@ -109,7 +110,7 @@ class CapturedBackend(PyTorchBackend):
     def load_weights(self, load: LoadState) -> None:
         make_caches_writable()
         super().load_weights(load)
-        self._stages = getattr(self.model, "stages", self.model)
+        self._stages = self._make_stages()
         if self.precision == "bf16" and hasattr(self.model, "attend"):
             self.model.attend = _attend
         self._graphs: dict[int, Graphs] = {}  # by number of cameras
@@ -119,6 +120,9 @@ class CapturedBackend(PyTorchBackend):
         self._turn: object = None  # of the observation whose images are in the inputs
         self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
         self._embed_images, self._prefix_of, self._velocity = map(self._stage, self._to_compile)
+
+    def _make_stages(self) -> Any:
+        return getattr(self.model, "stages", self.model)
 
     def warmup(
         self,

@@ -25,6 +25,7 @@ class EmulatedFp8Backend(PyTorchBackend):
     name: ClassVar[str] = "emulated_fp8"
     precisions: ClassVar[tuple[Precision, ...]] = FP8_TIERS
     forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # rounding has no derivative
+    writes: ClassVar[bool] = False
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(load)

@@ -273,6 +273,9 @@ class FusedBackend(CudaGraphBackend):
             pair: PairDenoiser | None = self._kernel(user, partial(self._hopper_kernel, user, table, pair=True))
             if pair is not None:
                 return pair
+        return self._batch_weights(loop, batch, rows)
+
+    def _batch_weights(self, loop: Loop, batch: int, rows: int) -> Weights:
         in_fp8 = self._plan is not None and self._plan.expert == "fp8" and loop.form != "jacobian"
         layers = self._expert.use("fp8" if in_fp8 else "layers", User("batch", loop, rows))
         return replace(self._weights, expert=layers)

@@ -5,12 +5,13 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Precision, Sample, StageTimer
-from turbopi.config import FloatPrecision, Network
+from turbopi.config import FloatPrecision, Network, TextConfig
 from turbopi.models import family_of
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditionings, Form
+from turbopi.models.pi0.conditioning import Conditionings, Form, has_two_prompts
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Pi0Model, Trace
+from turbopi.models.pi0.text import TextWriter
 from turbopi.support.errors import BackendError
 
 
@@ -23,7 +24,8 @@ class PyTorchBackend(Backend):
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
-    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "two_prompts", "two_prompts_jacobian")
+    writes: ClassVar[bool] = True
     model_class: ClassVar[type[Pi0Model] | None] = None
     _warm = False
     model: Any  # of the family
@@ -32,6 +34,9 @@ class PyTorchBackend(Backend):
         precision: FloatPrecision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
         model_class = self.model_class or family_of(self.config).reference
         self.model = model_class.from_state(self.config, load(self.device, precision))
+
+    def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
+        self.writer = TextWriter(self.model, text, head)
 
     @classmethod
     def refuses_model(cls, config: Network) -> str | None:
@@ -53,7 +58,8 @@ class PyTorchBackend(Backend):
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
         timer = StageTimer(self.device)
-        embedded = self.model.embed(observation.to(self.device))
+        two = {"conditioning": conditioning} if has_two_prompts(conditioning) else {}  # of Pi0's reference alone
+        embedded = self.model.embed(observation.to(self.device), **two)
         timer.mark("vision")  # with the prompt's embedding lookup
         cache = self.model.keys_values(embedded)
         timer.mark("prefix")

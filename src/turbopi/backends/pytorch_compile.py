@@ -110,6 +110,7 @@ class PyTorchCompileBackend(PyTorchBackend):
 
     name: ClassVar[str] = "pytorch_compile"
     forms: ClassVar[tuple[Form, ...]] = ()  # each would be compiled anew, for a minute
+    writes: ClassVar[bool] = False
     model_class: ClassVar[type[Pi0Model]] = CompiledModel
 
     def load_weights(self, load: LoadState) -> None:

@@ -21,10 +21,12 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.resize import Resizer
 from turbopi.models import family_of
+from turbopi.models.family import Ending
 from turbopi.models.observation import Observation, Past
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form
+from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0.kv_cache import KVCache
-from turbopi.models.pi0_fast.reference import Decoding, compacted
+from turbopi.models.pi0_fast.reference import compacted
 from turbopi.preprocess.pipeline import of_row
 from turbopi.support.errors import ActionError, ObservationError
 
@@ -33,6 +35,19 @@ if TYPE_CHECKING:
 
 LOOK = 4
 _FORCED = 16  # tokens whose logits are compared
+
+
+def finished(decoding: Decoding, step: Graph, ending: Ending, most: int) -> list[list[int]]:
+    """The answers behind a prefix, each to its end or `most` ids: `step` is launched without waiting for each."""
+    written = 1
+    while True:
+        for _ in range(min(LOOK, most - written)):
+            step.launch()
+            written += 1
+        if written == most or bool(decoding.ended.any()):
+            rows = decoding.rows(ending, most)
+            if rows is not None:
+                return rows
 
 
 class _Tokens(Backend):
@@ -210,13 +225,7 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
         if num_steps > most:
             raise ObservationError(f"an answer of {num_steps} tokens was requested; there is room for {most}")
         assert self.reader is not None
-        written, rows = 1, None
-        while rows is None:
-            for _ in range(min(LOOK, num_steps - written)):
-                graphs.step.launch()
-                written += 1
-            if written == num_steps or bool(graphs.decoding.ended.any()):
-                rows = graphs.decoding.rows(self.reader, num_steps)
+        rows = finished(graphs.decoding, graphs.step, self.reader, num_steps)
         timer.mark("denoise")
         return _Answered(self._actions(rows))
 

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from torch import Tensor
 
 from turbopi.checkpoint import known_hashes
+from turbopi.checkpoint.names import EMBEDDING
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
 from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig, memory_of
@@ -140,6 +141,26 @@ class Checkpoint:
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
 
+    def load_head(self, device: torch.device | str, precision: FloatPrecision) -> Tensor | None:
+        """The language head [V, D] of a Pi0.5 that writes text; None: its embedding table is the head.
+
+        Raises CheckpointError for an adapter's, and if a value is NaN or infinite.
+        """
+        if self.format == "lerobot" and not hasattr(self.source, "untied_head"):
+            raise CheckpointError(
+                f"{self.path} is an adapter, whose language head isn't read: merge it into its base model there "
+                "(merge_and_unload), and save that"
+            )
+        if (found := self._untied_head()) is None:
+            return None
+        check_finite(found, "lm_head.weight", self.path)
+        return found.to(device, family_of(self.config.model).parameter_dtype(EMBEDDING, precision, self.config.model))
+
+    def _untied_head(self) -> Tensor | None:
+        untied = getattr(self.source, "untied_head", None)
+        head: Tensor | None = None if untied is None else untied()
+        return head
+
     def check_hash(self) -> None:
         """Raise CheckpointError if the weights' SHA-256 isn't the one in the configuration, if it has one."""
         if self.expected_sha256 is not None and self.fingerprint() != self.expected_sha256:
@@ -149,7 +170,8 @@ class Checkpoint:
             )
 
     def fingerprint(self, *, trust_files: bool = False) -> str:
-        """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian).
+        """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian), and of
+        a pi052's language head where it isn't the embedding.
 
         Independent of the format and the stored dtype. Reads all weights, once per object; with `trust_files` the
         cached hash of files that look unchanged is used (known_hashes.py).
@@ -179,6 +201,9 @@ class Checkpoint:
         lines = [
             f"{name} {list(self.source.shapes[name])} {digest.hexdigest()}" for name, digest in sorted(hashes.items())
         ]
+        if getattr(self.source, "variant", "") == "head" and (head := self._untied_head()) is not None:
+            digest = hashlib.sha256(head.to(torch.float32).contiguous().numpy().data)
+            lines.append(f"lm_head {list(head.shape)} {digest.hexdigest()}")
         fingerprint = hashlib.sha256("\n".join(lines).encode()).hexdigest()
         if key is not None and key == self._files_key():  # nobody changed them meanwhile
             known_hashes.remember(key, fingerprint)
@@ -206,6 +231,7 @@ class Checkpoint:
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
             "memory": None if (memory := memory_of(self.config.model)) is None else asdict(memory),
+            "text": None if self.config.text is None else asdict(self.config.text),
             "normalization": {
                 "state": self.config.normalization.state,
                 "actions": self.config.normalization.actions,

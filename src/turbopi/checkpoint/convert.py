@@ -205,6 +205,8 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.planned_model.vision.num_heads,
     }
+    if config.one_step:
+        values["one_step"] = True
     if config.prompt_labels:
         values["prompt_labels"] = True
     if config.real_time != RealTime():

@@ -169,6 +169,8 @@ def _head_rules() -> list[Rule]:
         "state_proj",
         "action_time_mlp_in",
         "action_time_mlp_out",
+        "target_time_mlp_1",
+        "target_time_mlp_2",
     ):
         found += [
             Rule(f"{name}/kernel", (Output(f"{name}.weight", _transpose),)),

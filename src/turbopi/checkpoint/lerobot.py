@@ -78,6 +78,7 @@ class LeRobotFolder:
 
     keys: ClassVar[Keys] = PI
     own_settings: ClassVar[frozenset[str]] = frozenset()  # keys of a turbopi.json that are for this type alone
+    writes_text: ClassVar[bool] = False
 
     def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
@@ -86,7 +87,7 @@ class LeRobotFolder:
         self.memory = self._memory()
         # LeRobot trains it without the state in the prompt, and doesn't save that: a folder that it loads has it again
         state_tokens = self.memory is not None and self.memory.proprioceptive
-        self.pipelines = Pipelines(folder, self.kind, state_tokens=state_tokens)
+        self.pipelines = Pipelines(folder, self.kind, state_tokens=state_tokens, text=self.writes_text)
         self.stats, self._stats_files = self._read_stats()
         self.action_dim = self._width("output_features", ACTION, "max_action_dim")
         self.described_state_dim = self._width("input_features", STATE, "max_state_dim")
@@ -208,10 +209,12 @@ class LeRobotFolder:
 
     def _check_config(self) -> Kind:
         kind = self.config.values.get("type")
+        if self.writes_text and kind == "pi052":
+            kind = "pi05"
         if not isinstance(kind, str) or kind not in FAMILIES:
             raise CheckpointError(
                 f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's "
-                f"{' and '.join(map(repr, FAMILIES))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
+                f"{' and '.join(map(repr, (*FAMILIES, 'pi052')))} (and openpi's own checkpoints of Pi0 and Pi0.5)"
             )
         family = FAMILIES[kind]
         self._check_family(family)

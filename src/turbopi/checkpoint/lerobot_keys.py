@@ -6,7 +6,7 @@
 
 Any other key is noted with its value: another program may compute something from it.
 Source: `PreTrainedConfig`, `PI05Config`, `PI0Config`, `SmolVLAConfig`, `RTCConfig` of LeRobot 0.4.0 to 0.6.1 and of its
-main branch in August 2026 (7427f31), field by field.
+main branch in August 2026 (7427f31), field by field; of `PI052Config` in its open PR 4184 (f2c8867).
 """
 
 from collections.abc import Mapping
@@ -73,6 +73,31 @@ PI = Keys(
         | {"relative_exclude_joints"}  # the preprocessor's own list decides
     ),
     _OF_PI_NEUTRAL,
+)
+PI052 = Keys(
+    frozenset(
+        _OF_PI
+        | {"n_action_steps", "subtask_replan_steps", "joint_subtask_conditioning", "fast_skip_tokens"}
+        | {"text_loss_weight", "unfreeze_lm_head"}
+    ),
+    frozenset(
+        PI.harmless
+        | {
+            *("recipe_path", "flow_loss_weight", "plan_dropout_prob", "memory_dropout_prob", "subtask_dropout_prob"),
+            *("enable_fast_action_loss", "action_tokenizer_name", "max_action_tokens", "fast_action_loss_weight"),
+            *("auto_fit_fast_tokenizer", "fast_tokenizer_cache_dir", "fast_tokenizer_fit_samples"),
+            *("fast_tokenizer_validation_samples", "fast_tokenizer_max_reconstruction_rmse"),
+            *("fast_tokenizer_max_dim_rmse", "knowledge_insulation", "flow_num_repeats", "text_ce_z_loss_weight"),
+            *("use_flashrt_adarms", "use_compiled_text_ce", "use_compiled_vision", "use_flex_attention"),
+            *("use_manual_attention", "manual_attention_scope", "use_flashrt_fp8_mlp"),  # ways to compute the same
+            *("lm_head_lr_scale", "backbone_lr_scale", "action_expert_lr_scale", "optimizer_foreach"),
+        }
+    ),
+    {
+        **_OF_PI_NEUTRAL,
+        "apply_chat_template": ((False,), "prompts as `User: …`"),
+        "memory_scratchpad": ((False, None), "subtasks without a written memory"),
+    },
 )
 PI0_FAST = Keys(
     frozenset(

@@ -24,6 +24,11 @@ Preprocessor of Pi0-FAST: as Pi0.5's, with pi0_fast_prepare_state_tokenizer_proc
 
     action_tokenizer_processor                      for training; names the action tokenizer that the folder may have
 
+Preprocessor of pi052 (LeRobot's open PR 4184): as Pi0.5's, or in place of its last two, whose prompts inference makes
+by itself either way,
+
+    render_messages_processor, pi052_text_tokenizer, action_tokenizer_processor
+
 Postprocessor; both may be missing:
 
     unnormalizer_processor                          scales actions back
@@ -53,6 +58,7 @@ STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."
 RENAME, RELATIVE, NORMALIZER = "rename_observations_processor", "relative_actions_processor", "normalizer_processor"
 STATE_STEP, TOKENIZER = "pi05_prepare_state_tokenizer_processor_step", "tokenizer_processor"
 ACTION_TOKENIZER = "action_tokenizer_processor"
+TEXT_TOKENIZER, MESSAGES = "pi052_text_tokenizer", "render_messages_processor"
 NEW_LINE = "pi0_new_line_processor"
 UNNORMALIZER, ABSOLUTE, DEVICE = "unnormalizer_processor", "absolute_actions_processor", "device_processor"
 PALIGEMMA = "google/paligemma-3b-pt-224"
@@ -77,6 +83,11 @@ _STEPS: dict[str, dict[str, tuple[str, ...]]] = {
         ACTION_TOKENIZER: (
             *("action_tokenizer_name", "trust_remote_code", "max_action_tokens", "fast_skip_tokens"),
             *("paligemma_tokenizer_name", "allow_truncation"),
+        ),
+        MESSAGES: ("recipe", "dataset_ctx"),
+        TEXT_TOKENIZER: (
+            *("tokenizer_name", "max_length", "padding", "padding_side", "plan_dropout_prob", "memory_dropout_prob"),
+            *("subtask_dropout_prob", "interjection_dropout_prob", "dropout_seed"),
         ),
     },
     POSTPROCESSOR: {UNNORMALIZER: _SCALING, ABSOLUTE: ("enabled",), **_HARMLESS},
@@ -110,21 +121,22 @@ class Pipelines:
                     this machine. None: it is PaliGemma's, by its name
     notes           what isn't sure about them
     state_tokens    past states are tokens of their own (MEM): prompts have none, unless the file says so
+    text            it is a pi052's
     state_in_prompt whether prompts have the state: always Pi0.5's of LeRobot to 0.6.1, never Pi0's
     prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
                     0 for Pi0, which writes none
     """
 
-    def __init__(self, folder: Path, kind: Kind = "pi05", *, state_tokens: bool = False) -> None:
+    def __init__(self, folder: Path, kind: Kind = "pi05", *, state_tokens: bool = False, text: bool = False) -> None:
         self.notes: list[str] = []
         self._paligemma = FAMILIES[kind].paligemma
-        self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind)}
+        self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind, text)}
         self.rename_map = self._rename_map()
         self._check_task_keys()
         self.max_tokens = self._tokenizer()
         self.tokenizer = self._named_tokenizer(folder)
-        self.prompt_width, self.state_in_prompt = 0, False
-        if FAMILIES[kind].state_in_prompt:
+        self.prompt_width, self.state_in_prompt = 0, text
+        if FAMILIES[kind].state_in_prompt and not text:
             state_step = self.steps[STATE_STEP]
             self.prompt_width = state_step.config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
             self.state_in_prompt = state_step.config.flag("include_state_in_prompt", not state_tokens)
@@ -202,7 +214,10 @@ class Pipelines:
         # masked tokens change nothing, wherever they stand
         step.config.choice("padding", ("max_length", "longest"), "max_length")
         step.config.choice("padding_side", ("right", "left"), "right")
-        return step.config.integer("max_length", 1, LIMITS["max_prompt_tokens"], default=512)  # LeRobot's own default
+        # LeRobot's own defaults
+        return step.config.integer(
+            "max_length", 1, LIMITS["max_prompt_tokens"], 512 if MESSAGES not in self.steps else 200
+        )
 
     def _named_tokenizer(self, folder: Path) -> Path | None:
         """What the tokenizer's name points to, not what it is called: after 0.6.1 LeRobot saves the tokenizer, too."""
@@ -231,21 +246,21 @@ class Pipelines:
         return None
 
 
-def _read(file: Path, kind: Kind) -> list[Step]:
+def _read(file: Path, kind: Kind, text: bool) -> list[Step]:
     """The steps of one pipeline that compute something, each once and in the one order that Turbo-Pi has."""
     entries = read_json(file, hint="; is the download complete?").get("steps")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CheckpointError(f"{file} has no list of steps; is it a LeRobot processor?")
-    steps = [_step(entry, file, kind) for entry in entries]
+    steps = [_step(entry, file, kind, text) for entry in entries]
     names = [step.name for step in steps]
     for i, name in enumerate(names):
         if name in names[:i] and name not in _OFTEN:
             raise CheckpointError(f"{file} has the step {name} twice; Turbo-Pi does it once")
         late = next((earlier for earlier in names[:i] if _must_precede(name, earlier, kind)), None)
         if late is not None:
-            order = ", ".join(step for step in _ORDER if step in _known(file, kind) and step not in _NEW_LINES)
+            order = ", ".join(step for step in _ORDER if step in _known(file, kind, text) and step not in _NEW_LINES)
             raise CheckpointError(f"{file} has {late} before {name}, which computes something else than {order}")
-    needed = (STATE_STEP if FAMILIES[kind].state_in_prompt else NEW_LINE, TOKENIZER)
+    needed = (STATE_STEP if FAMILIES[kind].state_in_prompt else NEW_LINE, TOKENIZER)[text:]
     for name in needed if file.name == PREPROCESSOR else ():
         if name not in names and not (name == NEW_LINE and set(names) & set(_NEW_LINES)):
             theirs = FAMILIES[kind].state_step if name == STATE_STEP else name
@@ -259,9 +274,11 @@ def _must_precede(first: str, then: str, kind: Kind) -> bool:
     return (first, then) in _BEFORE and not apart
 
 
-def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
-    family = FAMILIES[kind]
-    steps = {name: keys for name, keys in _STEPS[file.name].items() if name not in (STATE_STEP, ACTION_TOKENIZER)}
+def _known(file: Path, kind: Kind, text: bool) -> dict[str, tuple[str, ...]]:
+    family, own = FAMILIES[kind], (STATE_STEP, ACTION_TOKENIZER, MESSAGES, TEXT_TOKENIZER)
+    steps = {name: keys for name, keys in _STEPS[file.name].items() if name not in own}
+    if file.name == PREPROCESSOR and text:
+        steps |= {name: _STEPS[file.name][name] for name in own[1:]}
     if file.name == PREPROCESSOR and family.state_step is not None:
         steps[family.state_step] = _STEPS[file.name][STATE_STEP]
     if file.name == PREPROCESSOR and family.reader is not None:
@@ -269,8 +286,8 @@ def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
     return steps
 
 
-def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
-    known = _known(file, kind)
+def _step(entry: dict[str, object], file: Path, kind: Kind, text: bool) -> Step:
+    known = _known(file, kind, text)
     given = entry.get("registry_name", entry.get("class"))
     name = _OTHER_NAMES.get(given, given) if isinstance(given, str) else None
     if name not in known:
@@ -291,6 +308,8 @@ def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
     state_file = None if "state_file" not in entry else fields.text("state_file")
     if name == FAMILIES[kind].state_step:
         name = STATE_STEP  # whichever family's: what it computes is `Family.prompt`'s
+    if name == TEXT_TOKENIZER:
+        name = TOKENIZER
     return Step(name, config, file, state_file, Fields(fields.object("artifacts", {}).values, file))
 
 

@@ -14,6 +14,7 @@ _LANGUAGE = _PALIGEMMA + "model.language_model."
 EMBEDDING = "vlm.embed_tokens.weight"
 TIED_HEAD = _PALIGEMMA + "lm_head.weight"  # openpi stores the tied embedding once, under the head's name
 TIED_EMBEDDING = _LANGUAGE + "embed_tokens.weight"
+_OF_TRAINING = ("value_head.", "noise_head.")  # RLinf's critic and exploration: what it deploys reads neither
 UNUSED_HEAD = "paligemma_with_expert.gemma_expert.lm_head.weight"  # in every file, read by nothing
 
 _PREFIXES = (  # canonical, openpi; the first that fits
@@ -89,17 +90,25 @@ class Names(Protocol):
 class PiNames:
     """Pi0's and Pi0.5's, openpi's and LeRobot's.
 
-    embedding  which of the tied two LeRobot computes with
+    embedding    which of the tied two LeRobot computes with
+    trains_head  LeRobot trains lm_head beside the embedding
     """
 
     embedding: str = TIED_EMBEDDING
+    trains_head: bool = False
 
     def canonical(self, key: str) -> str | None:
         key = current_name(key)
-        return None if key == UNUSED_HEAD else from_openpi(key)
+        return None if key == UNUSED_HEAD or key.startswith(_OF_TRAINING) else from_openpi(key)
 
     def native(self, name: str) -> str:
         return to_openpi(name)
+
+
+class TextNames(PiNames):
+    """LeRobot's pi052."""
+
+    trains_head = True
 
 
 class FastNames(PiNames):

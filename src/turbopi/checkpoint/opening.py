@@ -10,15 +10,18 @@ from turbopi.checkpoint.beside import notes_on_config_json, notes_on_settings
 from turbopi.checkpoint.lerobot import LeRobotFolder, policy_type
 from turbopi.checkpoint.lerobot_fast import FastFolder
 from turbopi.checkpoint.lerobot_smolvla import SmolVLAFolder
+from turbopi.checkpoint.lerobot_text import TextFolder
 from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
+from turbopi.checkpoint.rlinf import in_known_layout
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
+from turbopi.checkpoint.target_time import with_target_time
 from turbopi.checkpoint.torch_files import TorchSource
 from turbopi.config import Kind, ModelConfig, Pi0FastConfig, PolicyConfig
 from turbopi.models import FAMILIES, family_of, parameter_shapes
@@ -47,7 +50,9 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     def policy_of(settings: Settings) -> PolicyConfig:
         return policy_config(settings, kind, assets=asset_ids(folder / "assets"), where=folder)
 
-    policy = _with_sizes(policy_of(settings), source, settings, location)
+    chosen = policy_of(settings)
+    source, chosen = _with_target_time(source, chosen, settings, location)
+    policy = _with_sizes(chosen, source, settings, location)
     found = find_norm_stats(folder, policy.asset_id, policy.normalization)
     source.notes += found.notes
     if location.format != "onnx":
@@ -142,9 +147,9 @@ def _source(location: Location, settings: Settings) -> WeightSource:
     if location.format == "onnx":
         return GraphSource(open_export(location.folder))
     if location.format == "lerobot":
-        source = _lerobot_weights(location.weights, location)
+        source: WeightSource = _lerobot_weights(location.weights, location)
     else:
-        source = TorchSource(location.weights, format=location.format)
+        source = in_known_layout(TorchSource(location.weights, format=location.format), location.weights)
     if (location.weights / ADAPTER).is_file():
         source.notes.append(f"{ADAPTER} isn't followed: there are whole weights, and no use_peft = true in config.json")
     return source
@@ -168,13 +173,16 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
     return PeftSource(location.folder, weights, base.folder)
 
 
-_READERS: Mapping[Kind, type[LeRobotFolder]] = {  # by type of policy; others: LeRobotFolder
+_READERS: Mapping[Kind, type[LeRobotFolder]] = {  # of families whose weights have names of their own
     "smolvla": SmolVLAFolder,
     "pi0_fast": FastFolder,
 }
 
 
 def _lerobot_folder(location: Location) -> type[LeRobotFolder]:
+    """The reader of its type of policy."""
+    if policy_type(location.folder) == "pi052":
+        return TextFolder
     kind = _own_kind(location)
     return LeRobotFolder if kind is None else _READERS[kind]
 
@@ -193,14 +201,15 @@ def _kind(location: Location, source: WeightSource) -> Kind:
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
     untied, reader = getattr(source, "untied", False), _lerobot_folder(location)
-    detected = detect_kind(source, location.weights) if reader is LeRobotFolder else None  # or what they look like
+    detected = None if reader in _READERS.values() else detect_kind(source, location.weights)  # or what they look like
     for kind, other in _READERS.items():
         if other is not reader and (keys := settings.values.keys() & other.own_settings):
             raise ConfigError(f"{settings.source}: {min(keys)} only applies to {FAMILIES[kind].label}")
     folder = reader(location.folder, settings, untied=untied)
     if detected is not None:
         _check_type(detected, folder)
-    policy = _with_sizes(folder.policy_config(), source, settings, location)
+    source, chosen = _with_target_time(source, folder.policy_config(), settings, location)
+    policy = _with_sizes(chosen, source, settings, location)
     _check_type(policy.model.kind, folder)
     source.notes.extend(folder.notes())
     source.notes += notes_on_settings(
@@ -231,6 +240,23 @@ def _check_type(kind: Kind, folder: LeRobotFolder) -> None:
 def _action_tokenizers(settings: Settings, own: tuple[Path, ...]) -> tuple[Path, ...]:
     given = settings.values.get("action_tokenizer")
     return own if given is None else (Path(given),)
+
+
+def _with_target_time(
+    source: WeightSource, policy: PolicyConfig, settings: Settings, location: Location
+) -> tuple[WeightSource, PolicyConfig]:
+    """Weights with their target time, and the policy, then of one step."""
+    s = settings.target_time
+    source = with_target_time(source, s, location.weights, settings.source)
+    distilled = isinstance(s, float)
+    if not distilled and not policy.one_step:
+        return source, policy
+    if settings.values.get("num_denoising_steps", 1) != 1 or (distilled and not settings.values.get("one_step", True)):
+        raise ConfigError(
+            f"{settings.source}: these weights were distilled for one denoising step, so num_denoising_steps is 1 and "
+            "one_step true: leave both out"
+        )
+    return source, replace(policy, one_step=True, num_denoising_steps=1)
 
 
 def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, location: Location) -> PolicyConfig:

@@ -27,10 +27,14 @@ itself.
     real_time             object of trained_max_delay (delays that training simulated, control steps),
                           execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime. The delay is
                           below the action horizon, the execution horizon at most as long
+    text                  object of template, with {prompt} in it, and max_tokens, 1 to 1000: the language head was
+                          trained to continue the template (Pi0.5 only). pi052 describes itself
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
+    target_time           of weights distilled for one denoising step: 0 to 1, or "unused": see target_time.py
+    one_step              true if weights were distilled for one denoising step: other numbers are refused
     missing_cameras       "masked", or "black": seen as black images, as by openpi's Pi0-FAST
     action_tokenizer, max_decoding_steps, broken_answers
                           of Pi0-FAST alone: folder of the action tokenizer, relative to this file; tokens of an answer,
@@ -52,7 +56,21 @@ from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
-from turbopi.config import LIMITS, PRESETS, ImageResize, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
+from turbopi.checkpoint.target_time import UNUSED, TargetTime
+from turbopi.config import (
+    LIMITS,
+    PRESETS,
+    WITH_TEXT,
+    ImageResize,
+    Kind,
+    Normalization,
+    NormMode,
+    PolicyConfig,
+    RealTime,
+    TextConfig,
+    TimeGrid,
+    memory_of,
+)
 from turbopi.models import family_of
 from turbopi.models.pi0.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.support.errors import ConfigError
@@ -68,6 +86,7 @@ ABOUT_WEIGHTS = {
     "action_tokenizer",
     "weights_sha256",
     "lerobot_semantics",
+    "target_time",
 }  # keys of a .json
 ConfigSource = str | Path | PolicyConfig
 
@@ -88,6 +107,11 @@ class Settings:
     def weights_sha256(self) -> str | None:
         expected: str | None = self.values.get("weights_sha256")
         return expected
+
+    @property
+    def target_time(self) -> TargetTime | None:
+        s: TargetTime | None = self.values.get("target_time")
+        return s
 
     @property
     def vision_heads(self) -> int | None:
@@ -148,6 +172,7 @@ _OF_POLICY = (
     "prompt_labels",
     "missing_cameras",
     "num_denoising_steps",
+    "one_step",
     "solver",
     "solver_grid",
     "real_time",
@@ -173,12 +198,22 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     for key in of_model.keys() - {one.name for one in fields(config.model)}:
         raise ConfigError(f"{settings.source}: {key} can't be chosen for {family_of(config.model).label}")
     config = config.with_model(**of_model)
+    if "text" in values:
+        _check_text(config, settings.source)
+        config = replace(config, text=values["text"])
     check_real_time(config, settings.source)
     if config.discrete_state_input and not (family := family_of(config.model)).state_in_prompt:
         raise ConfigError(
             f"{settings.source}: discrete_state_input is true, but {family.label} reads its state as a number token"
         )
     return config
+
+
+def _check_text(config: PolicyConfig, source: str) -> None:
+    if config.model.kind not in WITH_TEXT or memory_of(config.model) is not None:
+        raise ConfigError(f"{source}: text can't be chosen for {family_of(config.model).label}; it is for Pi0.5")
+    if config.text is not None:
+        raise ConfigError(f"{source}: text can't be chosen for LeRobot's pi052, whose config.json describes it")
 
 
 def check_real_time(config: PolicyConfig, source: str) -> None:
@@ -330,6 +365,12 @@ def _real_time(value: object) -> RealTime:
     return RealTime(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
 
 
+def _text_config(value: object) -> TextConfig:
+    options = _object(value)
+    _require(set(options) <= {"template", "max_tokens"} and isinstance(options.get("template"), str))
+    return TextConfig(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
+
+
 def _solver_grid(value: object) -> TimeGrid:
     if not isinstance(value, str | list):
         raise ValueError
@@ -341,6 +382,14 @@ _ALPHAS = (1e-6, 1e6)  # in use are 8 to 128
 
 def _number(value: object) -> float:
     if not is_finite(value) or not _ALPHAS[0] <= value <= _ALPHAS[1]:
+        raise ValueError
+    return float(value)
+
+
+def _target_time(value: object) -> TargetTime:
+    if value == UNUSED:
+        return UNUSED
+    if not is_finite(value) or not 0 <= value <= 1:
         raise ValueError
     return float(value)
 
@@ -377,6 +426,10 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
         "linear, ones or zeros) or max_guidance_weight (a number from 0)",
         _real_time,
     ),
+    "text": (
+        "an object with template, a text with {prompt} in it, and perhaps max_tokens, a whole number from 1 to 1000",
+        _text_config,
+    ),
     "vision_heads": _count(LIMITS["num_heads"]),
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),
@@ -386,5 +439,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "max_decoding_steps": _count(LIMITS["max_decoding_steps"]),
     "broken_answers": ("'refuse' or 'owners'", _choice("refuse", "owners")),
     "missing_cameras": ("'masked' or 'black'", _choice("masked", "black")),
+    "target_time": (f"a number from 0 to 1, or {UNUSED!r}", _target_time),
+    "one_step": ("true or false", _flag),
     "weights_sha256": ("64 digits, 0 to 9 and a to f, as `turbopi inspect --hash` shows them", _sha256),
 }

@@ -71,6 +71,8 @@ class TorchSource:
         self._stored: dict[str, Stored] = {}
         heads: dict[str, Stored] = {}
         self.untied = False  # whether lm_head and the embedding are both stored
+        self.head: Stored | None = None  # lm_head, where LeRobot has one beside the embedding
+        self.variant = "head" if getattr(self.names, "trains_head", False) else ""  # `Checkpoint.fingerprint` has it
         for stored in stored_tensors:
             key = current_name(stored.key.removeprefix(self._prefix))
             tied = key in (TIED_HEAD, TIED_EMBEDDING)
@@ -102,6 +104,10 @@ class TorchSource:
     def native_name(self, name: str) -> str:
         return self._stored[name].key if name in self._stored else self._prefix + self.names.native(name)
 
+    def stored(self, name: str) -> Stored:
+        """Where a parameter is."""
+        return self._stored[name]
+
     def pieces(self, device: torch.device) -> Iterator[Piece]:
         by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))
         for name in by_size:
@@ -113,6 +119,13 @@ class TorchSource:
             for start, stop in row_ranges(stored.shape, ITEMSIZE[stored.dtype]):
                 yield Piece(name, start, values[start:stop])
 
+    def untied_head(self) -> Tensor | None:
+        """The language head's values, mapped, where they aren't the embedding's; None: it is tied to it."""
+        if self.head is None:
+            return None
+        head, embedding = read_tensor(self.head), read_tensor(self._stored[EMBEDDING])
+        return None if head.dtype == embedding.dtype and _equal(head, embedding) else head
+
     def _tied(self, heads: dict[str, Stored], folder: Path) -> Stored:
         """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values.
 
@@ -121,7 +134,8 @@ class TorchSource:
         if len(heads) == 1:
             return next(iter(heads.values()))
         head, embedding = heads[TIED_HEAD], heads[TIED_EMBEDDING]
-        alike = head.shape == embedding.shape and head.dtype == embedding.dtype
+        apart = getattr(self.names, "trains_head", False)
+        alike = head.shape == embedding.shape and (apart or head.dtype == embedding.dtype)
         # LeRobot loads the file's tensors in its order, sorted by dtype, then name; each of the two ends up as the
         # embedding, the last one for good
         if not alike or not (self.format == "lerobot" or _equal(read_tensor(head), read_tensor(embedding))):
@@ -131,6 +145,10 @@ class TorchSource:
             )
         # a look at the first rows will do: weight decay changes all of them
         taken = head if getattr(self.names, "embedding", TIED_EMBEDDING) == TIED_HEAD else embedding
+        if taken is embedding and self.format == "lerobot":
+            self.head = head
+        if apart:
+            return taken
         if not torch.equal(read_tensor(head)[:1024], read_tensor(embedding)[:1024]):
             name = "lm_head" if taken is head else "embed_tokens"
             self.notes.append(f"lm_head and embed_tokens differ: prompts are embedded by {name}, as LeRobot does")

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from turbopi.config import typed_grid
 from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import ConfigError
 
@@ -32,16 +31,17 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
-    model, name = checkpoint.config.model, fitting.backend
+    model, name, writes = checkpoint.config.model, fitting.backend, checkpoint.config.writes_subtasks
     if name == "auto":
-        backends.qualified(device, precision, model, bar=sys.stderr.isatty())  # type: ignore[arg-type]
-        name = backends.choose(device, precision, model)[0]  # type: ignore[arg-type]
+        backends.qualified(device, precision, model, bar=sys.stderr.isatty(), writes=writes)  # type: ignore[arg-type]
+        name = backends.choose(device, precision, model, writes=writes)[0]  # type: ignore[arg-type]
     backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
-    cls = backends.class_for(name, model)
-    requested = Denoising.of(checkpoint.config, fitting.steps, fitting.solver, typed_grid(fitting.time_grid))  # type: ignore[arg-type]
+    cls = backends.class_for(name, model, writes=writes)
+    requested = Denoising.of(checkpoint.config, *fitting.flow_arguments)
     no_pipeline: Any = None  # no observation is read
-    modes = ChunkConditioning(checkpoint.config, no_pipeline, cls, requested.integration).modes
-    batches = cls.runs_batches and (requested.integration is None or requested.integration.is_euler)
+    own = requested.integration, requested.two_prompts
+    modes = ChunkConditioning(checkpoint.config, no_pipeline, cls, *own).modes
+    batches = cls.runs_batches and requested.runs_together
     return Capabilities(
         real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},
         pipelined=cls.submits,

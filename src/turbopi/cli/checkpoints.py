@@ -172,6 +172,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
             ("action horizon", f"{info['action_horizon']}, {_made_in(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             *([] if info["memory"] is None else [("memory", _memory(info["memory"]))]),
+            *([] if info["text"] is None else [("text", _text(info["text"]))]),
             ("statistics", _statistics_source(info)),
             *_features(info),
             *((f"sizes: {name}", _sizes(sizes)) for name, sizes in info["sizes"].items() if isinstance(sizes, dict)),
@@ -227,6 +228,13 @@ def _state_input(info: dict[str, Any]) -> str:
     if FAMILIES[info["kind"]].reads_state:
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
+
+
+def _text(text: dict[str, Any]) -> str:
+    writes = f"continues {text['template']!r}" if text["trained"] else "none: its language head wasn't trained"
+    if (subtasks := text["subtasks"]) is None:
+        return writes
+    return f"{writes}; a subtask for {subtasks['chunks']} chunks{', joint' if subtasks['joint'] else ''}"
 
 
 def _memory(memory: dict[str, Any]) -> str:

@@ -27,6 +27,7 @@ OF_CHECKPOINT = {  # what may come from a checkpoint, too: an option's name, and
     "steps": "num_denoising_steps",
     "solver": "solver",
     "time_grid": "time_grid",
+    "guidance": "guidance",
 }
 
 
@@ -91,15 +92,13 @@ def scaled_as(options: "FleetOptions", running: Mapping[str, Any], given: Collec
 
 def runs(policy: PolicyOptions, opened: "Checkpoint") -> dict[str, Any]:
     """Of the metadata that a policy will have, what may come from its checkpoint. Raises ConfigError."""
-    from turbopi.config import typed_grid
     from turbopi.policy.call_options import Denoising
 
     fitting = policy.for_checkpoint(opened)
-    requested: Any = (fitting.steps, fitting.solver, typed_grid(fitting.time_grid))
     return {
         "config": opened.config.name,
         "precision": fitting.precision_of(fitting.backend),
-        **Denoising.of(opened.config, *requested).metadata,
+        **Denoising.of(opened.config, *fitting.flow_arguments).metadata,
     }
 
 
@@ -111,7 +110,7 @@ def changes(
     before, after  the options that the replicas were started with, and those of the update
     metadata, new  the running policy's, and `runs` of the new one
     """
-    named = [(name, metadata.get(key), new[key]) for name, key in OF_CHECKPOINT.items()]
+    named = [(name, metadata.get(key), new.get(key)) for name, key in OF_CHECKPOINT.items()]
     named += [(name, before.get(name), after[name]) for name in after if name not in OF_CHECKPOINT]
     return [f"{_spelled(name)}: {_said(old)} -> {_said(value)}" for name, old, value in named if old != value]
 

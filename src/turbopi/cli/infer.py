@@ -44,6 +44,7 @@ class _InferCommand(CheckpointThen):
         "turbopi infer checkpoints/pi05_libero observation.npz --config pi05_libero",
         "turbopi infer checkpoints/mine my_observation/ -o mine.npz --seed 7",
         "turbopi infer --random-weights pi05_tiny recordings/20260101T120000Z --call 0",
+        "turbopi infer checkpoints/my_pi052 observation.npz --generate 'tidy the table'",
     ),
 )
 def infer(
@@ -79,6 +80,14 @@ def infer(
     call: Annotated[
         int | None, typer.Option("--call", min=0, metavar="N", help="Of a recording, only call N.", show_default="all")
     ] = None,
+    generate: Annotated[
+        str | None,
+        typer.Option(
+            "--generate",
+            metavar="PROMPT",
+            help="Print the text that the policy writes to PROMPT ('': the observation's own), and make no actions.",
+        ),
+    ] = None,
     warmup: Annotated[bool, typer.Option("--warmup/--no-warmup", help="Run once before, for true times.")] = True,
     as_json: JsonFlag = False,
 ) -> None:
@@ -93,12 +102,18 @@ def infer(
         raise ConfigError("--noise and --seed were both given; give one of them")
     if plot is not None and no_plot:
         raise ConfigError("--plot and --no-plot were both given; give one of them")
+    if generate is not None:
+        if noise is not None or seed is not None or plot is not None:
+            raise ConfigError("--generate makes no actions: leave out --noise, --seed and --plot")
+        _print_text(options, checkpoint, _sources(Path(source), call), generate, output)
+        return
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
     from turbopi.models import family_of
     from turbopi.policy.call_options import checked_noise
     from turbopi.policy.known_cameras import KnownCameras
     from turbopi.policy.readings import Checks
+    from turbopi.realtime.messages import keeps_episode
     from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
@@ -127,9 +142,10 @@ def infer(
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
     policy = options.make_policy(opened, output)
-    if "memory" in policy.metadata:
+    if keeps_episode(policy.metadata):
         first_one = "the first observation of an episode" if len(sources) == 1 else "one episode, in this order"
-        output.line(f"note: this policy has memory, and takes what it is given as {first_one}", "yellow")
+        what = "has memory" if "memory" in policy.metadata else "holds subtasks"
+        output.line(f"note: this policy {what}, and takes what it is given as {first_one}", "yellow")
     draw = _noise(model, given_noise, seed, output)
     if warmup:
         if policy.backend.name == "pytorch_compile":
@@ -152,6 +168,21 @@ def infer(
             "policy": policy.metadata,
         }
     )
+
+
+def _print_text(
+    options: ActingOptions, checkpoint: str | None, sources: list[Path], prompt: str, output: Output
+) -> None:
+    from turbopi.recordings import load_observation
+
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    policy, texts = options.make_policy(opened, output), []
+    for source in sources:
+        with _naming(source):
+            texts.append(policy.generate(load_observation(source), prompt=prompt or None))
+        output.line("".join(letter if letter.isprintable() else "?" for letter in texts[-1]))
+    output.document({"text": texts, "policy": policy.metadata})
 
 
 @dataclass(frozen=True)
@@ -273,6 +304,8 @@ def _run(
             with _naming(source):
                 result = policy.infer(observation, noise=noise, readings=True)
             notes = noted.of(source, result.get(READING))
+            if "subtask" in result:
+                noted.output.line(f"subtask: {result['subtask']!r}")
             kept = observation if number < MAX_ROWS else None
             answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"], notes))
     return answers

@@ -71,6 +71,27 @@ TimeGridOption = Annotated[
         "to 0. Unless given: what the checkpoint says, else uniform.",
     ),
 ]
+GuidanceOption = Annotated[
+    float | None,
+    _option(
+        "--guidance",
+        panel=_RUNNING,
+        metavar="SCALE",
+        help="Classifier-free guidance towards --guidance-tag. 1 unless given: the prompt with the tag alone. 0: the "
+        "prompt alone. Any other number takes both prompts.",
+    ),
+]
+GuidanceTagOption = Annotated[
+    str | None,
+    _option(
+        "--guidance-tag",
+        panel=_RUNNING,
+        metavar="TEXT",
+        help="What training put behind the prompts of good data, such as 'Advantage: positive' (RECAP).",
+    ),
+]
+# UnifiedPolicy's arguments of how noise becomes actions
+FLOW = ("num_denoising_steps", "solver", "time_grid", "guidance", "guidance_tag")
 
 
 @dataclass(frozen=True)
@@ -230,6 +251,8 @@ class PolicyOptions(RobotOptions):
     ] = None
     solver: SolverOption = None
     time_grid: TimeGridOption = None
+    guidance: GuidanceOption = None
+    guidance_tag: GuidanceTagOption = None
     device: Annotated[
         str,
         _option("--device", panel=_RUNNING, metavar="DEVICE", help="cpu, cuda, cuda:N, or auto: the GPU if any."),
@@ -249,15 +272,18 @@ class PolicyOptions(RobotOptions):
         _option("--default-prompt", panel=_RUNNING, metavar="TEXT", help="Instruction for observations without one."),
     ] = None
 
+    @property
+    def flow_arguments(self) -> tuple[Any, ...]:
+        """Values of FLOW."""
+        return self.steps, self.solver, typed_grid(self.time_grid), self.guidance, self.guidance_tag
+
     def policy_arguments(self) -> dict[str, Any]:
         """UnifiedPolicy's arguments besides the checkpoint."""
         return {
             "backend": self.backend,
             "precision": self.precision_of(self.backend),
             "quantization": self._quantization(),
-            "num_denoising_steps": self.steps,
-            "solver": self.solver,
-            "time_grid": typed_grid(self.time_grid),
+            **dict(zip(FLOW, self.flow_arguments, strict=True)),
             "device": self.device,
             "tokenizer": self.tokenizer,
             "default_prompt": self.default_prompt,

@@ -22,7 +22,7 @@ from turbopi.support.errors import ConfigError
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-    from turbopi.policy.history import ObservationHistory
+    from turbopi.policy.history import History
     from turbopi.policy.policy import UnifiedPolicy
     from turbopi.realtime.running_chunk import JoinMode
     from turbopi.recordings.format import RecordImages
@@ -169,8 +169,8 @@ def serve(
             "--execution",
             rich_help_panel=_REAL_TIME,
             metavar="WAY",
-            help="Join each client's chunks, without any change of the client: rtc, rtc_identity or rtc_trained, "
-            "with --control-hz. See docs/real_time.md",
+            help="Join each client's chunks, the client unchanged: rtc, rtc_identity, rtc_trained or warm_start, with "
+            "--control-hz. See docs/real_time.md",
         ),
     ] = None,
     control_hz: Annotated[
@@ -324,11 +324,14 @@ class _Cold:
     def gives_readings(self) -> bool:
         return getattr(self._policy, "gives_readings", False)  # a policy of one's own may have none
 
-    def new_history(self) -> "ObservationHistory":
+    def new_history(self) -> "History":
         return self._policy.new_history()
 
     def observe(self, obs: dict[str, object], /, **arguments: Any) -> None:
         self._policy.observe(obs, **arguments)
+
+    def generate(self, obs: dict[str, object], /, **arguments: Any) -> str:
+        return self._policy.generate(obs, **arguments)
 
     def infer(self, obs: dict[str, object], /, **arguments: Any) -> dict[str, object]:
         return self._policy.infer(obs, **arguments)

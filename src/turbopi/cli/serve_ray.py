@@ -227,7 +227,8 @@ def _open(requested: Requested, checkpoint: str | None, output: Output) -> "Chec
     from turbopi.config import memory_of
 
     opened = requested.policy.open(checkpoint)
-    if memory_of(opened.config.model) is not None:
+    text = opened.config.text
+    if memory_of(opened.config.model) is not None or (text is not None and text.subtasks is not None):
         raise ConfigError(
             f"{opened.path} has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
         )

@@ -7,6 +7,7 @@ _COLUMNS = {
     "preprocess": "preprocess_ms",
     "queue": "queue_ms",
     "vision": "vision_ms",
+    "text": "text_ms",
     "prefix": "prefix_ms",
     "denoise": "denoise_ms",
     "postprocess": "postprocess_ms",

@@ -12,6 +12,8 @@ OF_POLICIES = {
     "num_denoising_steps": "--steps",
     "solver": "--solver",
     "time_grid": "--time-grid",
+    "guidance": "--guidance",
+    "guidance_tag": "--guidance-tag",
     "device": "--device",
     "tokenizer": "--tokenizer",
     "default_prompt": "--default-prompt",

@@ -23,7 +23,7 @@ from turbopi.engine.backward import Expert, backward_ops, jacobian_velocity
 from turbopi.engine.call import Cache, Images
 from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
-from turbopi.engine.loops import ConditionedLoop, EulerLoop
+from turbopi.engine.loops import ConditionedLoop, EulerLoop, Loop, SolverLoop
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
@@ -42,6 +42,7 @@ class BatchSize:
     batch: int  # observations
     images: int  # of all of them together
     float_images: bool = False  # as `CallShape`'s
+    two_prompts: bool = False  # as `GraphKey`'s
 
 
 class SharedRows:
@@ -95,7 +96,8 @@ class BatchBuffers:
         self.config, self.weights, self.ops, self.size, self.images = config, weights, ops, size, images
         assert images.cameras == size.images
         table = weights.embed_tokens
-        self.device, self.rows = table.device, images.rows + prompt_slots
+        self.image_rows = images.rows * (size.batch if size.two_prompts else 1)
+        self.device, self.rows = table.device, self.image_rows + prompt_slots
         shared = shared or SharedRows(config, table.dtype, self.device)
         self.cache, self.embs = shared.cache(self.rows), shared.embs(self.rows)
         self.segments = torch.zeros((2, size.batch + 1), dtype=torch.int32, device=self.device)
@@ -107,7 +109,7 @@ class PackedPrefix:
 
     def __init__(self, buffers: BatchBuffers, prompt_slots: int) -> None:
         self._buffers, config, device = buffers, buffers.config, buffers.device
-        self.rows = buffers.images.rows + prompt_slots
+        self.rows = buffers.image_rows + prompt_slots
         assert 0 < self.rows <= buffers.rows
         batch, heads = buffers.size.batch, config.vlm.num_heads
         fields = {
@@ -135,6 +137,7 @@ class PackedPrefix:
             rows=self.rows,
             per_image=config.vision.num_tokens,
             heads=config.vlm.num_heads,
+            same_images=self._buffers.size.two_prompts,
         )
         for name, array in self._arrays.items():
             array[:] = getattr(packed, name)
@@ -163,32 +166,40 @@ class BatchLoop:
     """All denoising steps of a batch, from the keys and values that `PackedPrefix` left.
 
     In a conditioned loop each action has its own time, step and pull; of an observation without a conditioning they are
-    openpi's. An Euler loop has none of that.
+    openpi's. An Euler loop has none of that. With two prompts both rows go on with the mixture of their velocities, so
+    they stay the same; a solver's loop is one of those alone.
     """
 
     def __init__(
         self,
         buffers: BatchBuffers,
-        loop: EulerLoop | ConditionedLoop,
+        loop: Loop,
         by: Weights
         | PairDenoiser,  # operations with these, perhaps others than those of `buffers`; or, of two, a kernel
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation; a conditioned loop's: [U, …]
     ) -> None:
         by_token = loop if isinstance(loop, ConditionedLoop) else None
-        assert by_token is None or isinstance(by, Weights), loop
+        plain = isinstance(loop, EulerLoop) and not buffers.size.two_prompts
+        assert plain or isinstance(by, Weights), loop
+        assert loop.form != ("jacobian" if buffers.size.two_prompts else "solver"), loop
         self._buffers, self._by = buffers, by
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
+        self._integration = loop.integration if isinstance(loop, SolverLoop) else None
         self._tokens = loop.horizon + family_of(config).state_token
         self._conditioned = None if by_token is None else Conditioned.allocate(config, by_token, device, batch)
         self._times = StepTimes.of(config, loop, table, self._conditioned, device)
         chunk = (batch, loop.horizon, config.action_dim)
-        fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
+        fields = {
+            "noise": (chunk, torch.float32),
+            "state": ((batch, config.action_dim), torch.float32),
+            "factors": ((2, 1, 1), torch.float32),  # of the velocities of two prompts
+        }
         self._host, host = allocate(fields, torch.device("cpu"), pinned=on_gpu)
         self._arrays = {name: view.numpy() for name, view in host.items()}
         self._flat, inputs = allocate(fields, device, pinned=False)
-        self._noise, self._state = inputs["noise"], inputs["state"]
+        self._noise, self._state, self._factors = inputs["noise"], inputs["state"], inputs["factors"]
         self._offsets = torch.arange(self._tokens, device=device)
         self._rope = forward.rope_of_all_positions(config, buffers.rows + self._tokens, device)
         self.x_t = torch.empty(loop.steps + 1, *chunk, device=device)
@@ -210,6 +221,11 @@ class BatchLoop:
             array = self._arrays[name]
             array[: len(given)] = given
             array[len(given) :] = 0
+        if self._buffers.size.two_prompts:
+            assert conditionings is not None and conditionings[0] is not None
+            guidance = conditionings[0].prompt
+            assert guidance is not None
+            self._arrays["factors"][:, 0, 0] = guidance.factors
         if self._conditioned is None:
             return
         for row in range(self._buffers.size.batch):
@@ -241,25 +257,30 @@ class BatchLoop:
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
         self.x_t[0] = self._noise
-        conditioned = self._conditioned
-        if conditioned is None and family_of(self._buffers.config).modulated:
+        conditioned, two = self._conditioned, self._buffers.size.two_prompts
+        if conditioned is None and not two and family_of(self._buffers.config).modulated:
             self._run_plain_steps(weights, rope)
             return
         whole = self._whole_cache() if conditioned is not None and conditioned.loop.jacobian else None
         for step in range(self._steps):
             x_t = self.x_t[step]
-            if conditioned is None:
-                v_t = self._velocity(weights, step, rope)
-                self.x_t[step + 1] = euler_step(x_t, v_t, self._steps)
+            if conditioned is not None and whole is not None:
+                expert = self._expert(weights, step, rope, *whole)
+                tokens, time = self._suffix(weights, step), self._times.embedding(step)
+                v_t = jacobian_velocity(expert, conditioned, step, x_t, tokens, time)
             else:
-                if whole is None:
-                    v_t = conditioned.pulled(step, x_t, self._velocity(weights, step, rope))
-                else:
-                    expert = self._expert(weights, step, rope, *whole)
-                    tokens, time = self._suffix(weights, step), self._times.embedding(step)
-                    v_t = jacobian_velocity(expert, conditioned, step, x_t, tokens, time)
-                self.x_t[step + 1] = conditioned.next_x(step, x_t, v_t)
+                v_t = self._velocity(weights, step, rope)
+                if two:
+                    v_t = (self._factors * v_t).sum(0).expand_as(v_t)
+                if conditioned is not None:
+                    v_t = conditioned.pulled(step, x_t, v_t)
             self.v_t[step] = v_t
+            if self._integration is not None:
+                self.x_t[step + 1] = self._integration.next_x(step, self.x_t, self.v_t)
+            elif conditioned is not None:
+                self.x_t[step + 1] = conditioned.next_x(step, x_t, v_t)
+            else:
+                self.x_t[step + 1] = euler_step(x_t, v_t, self._steps)
 
     def _run_plain_steps(self, weights: Weights, rope: forward.Rope) -> None:
         """Pi0.5's, where one operation leads from a step's last layer to the next one's tokens."""

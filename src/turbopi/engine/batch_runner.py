@@ -5,6 +5,8 @@ backend's `batch_costs`; they run one after the other. One observation alone is 
 Which observations may share a call: `plan.groups`. A call whose observations are all plain has the plain loop; a
 conditioned loop takes each action's own time, so plain observations fit it, too.
 
+One observation with two prompts is a batched call of two rows that see the same images (`PromptGuidance`).
+
 A batched call is three graphs. Their rows lie in the same buffers whatever the size, as calls run one after the other.
 """
 
@@ -21,20 +23,20 @@ from turbopi.engine import plan
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix, SharedRows
 from turbopi.engine.call import Images
 from turbopi.engine.graph_cache import Captured
-from turbopi.engine.loops import ConditionedLoop, EulerLoop, Loop, batch_form, loop_of_batch
+from turbopi.engine.loops import Loop, batch_form, loop_of_batch
 from turbopi.engine.plan import GraphKey, split
 from turbopi.engine.runner import GraphRunner, HostRow, floats, padded_trace
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
 from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, check_rows, of_rows
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, check_rows, has_two_prompts, of_rows
 from turbopi.models.pi0.reference import Trace
 from turbopi.models.pi0.sample import Sample
 
 STAGES = ("vision", "prefix", "denoise")
 Rows = Sequence[Conditioning | None]  # of each observation
 Finish = Callable[[Sequence[np.ndarray], np.ndarray, np.ndarray, int, Rows], Sample]
-Call = tuple[int, list[int]]  # for how many observations it is, and which ones are in it
+Call = tuple[int, list[int]]  # for how many observations it is (0: one with two prompts), and which ones are in it
 
 
 class BegunBatch:
@@ -68,7 +70,7 @@ class BegunBatch:
             these = [tokens[row] for row in rows], state[rows], noise[rows]
             samples.append(finish(*these, num_steps, [given[row] for row in rows]))
             actions[rows] = samples[-1].actions.numpy()
-        stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
+        stages = {name: sum(one.stage_ms.get(name, 0.0) for one in samples) for name in samples[0].stage_ms}
         return Sample(torch.from_numpy(actions), stages)
 
     def _begun(self, number: int) -> Finish:
@@ -113,7 +115,7 @@ class BatchRunner(GraphRunner):
         """See `turbopi.backends.base.Backend`."""
         cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
         form, actions = batch_form(conditioning), self.config.action_horizon if horizon is None else horizon
-        if form == "solver":  # they run alone
+        if form in ("solver", "two_prompts"):  # they run alone
             return
         loop = loop_of_batch([conditioning], num_steps, actions, self.config)
         self._check_cameras(cameras)
@@ -124,15 +126,15 @@ class BatchRunner(GraphRunner):
     def _make(self, key: GraphKey) -> Captured:
         if key.batch == 1 or key.part in ("vision", "resized"):
             return super()._make(key)
-        buffers = self._buffers_of(BatchSize(key.batch, key.images, key.float_images))
+        buffers = self._buffers_of(BatchSize(key.batch, key.images, key.float_images, key.two_prompts))
         if key.part == "prefix":
             prefix = PackedPrefix(buffers, key.slots)
             prefix.write([0] * key.batch, [np.zeros(1, np.int64)] * key.batch)
             return Captured(self._capture(prefix.run, None), prefix)
         loop = key.loop
-        assert isinstance(loop, EulerLoop | ConditionedLoop), key
-        table = self._table(loop)
-        run = BatchLoop(buffers, loop, self._batch_denoises_by(loop, key.batch, buffers.rows), table)
+        assert loop is not None, key
+        by = self._batch_weights if key.two_prompts else self._batch_denoises_by
+        run = BatchLoop(buffers, loop, by(loop, key.batch, buffers.rows), self._table(loop))
         return Captured(self._capture(run.run, None), run)
 
     def _images(self, key: GraphKey) -> Images:
@@ -149,11 +151,13 @@ class BatchRunner(GraphRunner):
             self._buffers[size] = BatchBuffers(*own, size, images, most, self._shared)
         return self._buffers[size]
 
-    def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
-        """What denoises a batch with up to so many prefix rows: operations with these weights, or a kernel for two
-        observations of a plain loop. Its graph goes on pointing to it.
-        """
+    def _batch_weights(self, loop: Loop, batch: int, rows: int) -> Weights:
+        """What operations denoise a batch with up to so many prefix rows with. Its graph goes on pointing to it."""
         return self._weights
+
+    def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
+        """The same, or a kernel for two observations of a plain loop."""
+        return self._batch_weights(loop, batch, rows)
 
     def begin_batch(
         self,
@@ -169,7 +173,7 @@ class BatchRunner(GraphRunner):
         def begin(size: int, these: Sequence[Sequence[np.ndarray]]) -> Finish:
             if size == 1:
                 return self._begin_one(these[0], resize)
-            return self._begin_call(size, these, resize, float_images)
+            return self._begin_call(size or 2, these, resize, float_images, two_prompts=size == 0)
 
         return BegunBatch(begin, self._calls_of(forms or ["plain"] * len(images)), images)
 
@@ -184,27 +188,42 @@ class BatchRunner(GraphRunner):
         return finish
 
     def _begin_call(
-        self, batch: int, images: Sequence[Sequence[np.ndarray]], resize: ImageResize | None, float_images: bool
+        self,
+        batch: int,
+        images: Sequence[Sequence[np.ndarray]],
+        resize: ImageResize | None,
+        float_images: bool,
+        *,
+        two_prompts: bool = False,
     ) -> Finish:
         """Start on the images of up to `batch` observations; returns what ends their call, as `Begun.finish`.
 
+        two_prompts: of one observation, whose conditioning has the second prompt; then `batch` is 2.
         A wrong image of a later part raises when the earlier ones have been launched. Nothing comes of these.
         """
         cameras, turn = [len(one) for one in images], object()
-        sizes = (batch, plan.batch_images(batch, cameras), float_images)
+        sizes = (batch, cameras[0] if two_prompts else plan.batch_images(batch, cameras), float_images)
 
         def finish(
             tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, conditionings: Rows
         ) -> Sample:
             self._check_turn(turn)
-            loop = loop_of_batch(conditionings, num_steps, noise.shape[1], self.config)
-            for count, prompt in zip(cameras, tokens, strict=True):
-                self._check_tokens(count, len(prompt))
+            seen, count = cameras, len(noise)
+            if two_prompts:
+                (one,) = conditionings
+                assert one is not None and one.prompt is not None
+                tokens, conditionings = [*tokens, one.prompt.tokens], [one, one]
+                noise, state, seen = noise.repeat(2, axis=0), state.repeat(2, axis=0), cameras * 2
+                loop = self._loop(conditionings[0], num_steps, noise.shape[1])
+            else:
+                loop = loop_of_batch(conditionings, num_steps, noise.shape[1], self.config)
+            for each, prompt in zip(seen, tokens, strict=True):
+                self._check_tokens(each, len(prompt))
             with self._explaining():
                 slots = plan.batch_slots(batch, [len(prompt) for prompt in tokens])
-                prefix = self._graph(GraphKey("prefix", *sizes, slots))
-                denoise = self._graph(GraphKey("denoise", *sizes, loop=loop))
-                prefix.buffers.write(cameras, tokens)
+                prefix = self._graph(GraphKey("prefix", *sizes, slots, two_prompts=two_prompts))
+                denoise = self._graph(GraphKey("denoise", *sizes, loop=loop, two_prompts=two_prompts))
+                prefix.buffers.write(seen, tokens)
                 denoise.buffers.write(noise, state, conditionings)
                 prefix.graph.launch()
                 self._mark(2)
@@ -213,7 +232,7 @@ class BatchRunner(GraphRunner):
                 if self._marks:
                     self._marks[-1].synchronize()
                 times = [start.elapsed_time(end) for start, end in itertools.pairwise(self._marks)]
-                actions = torch.from_numpy(denoise.buffers.actions_array[: len(noise)].copy())
+                actions = torch.from_numpy(denoise.buffers.actions_array[:count].copy())
             self._begun = None
             return Sample(actions, dict(zip(STAGES, times, strict=False)))
 
@@ -237,7 +256,7 @@ class BatchRunner(GraphRunner):
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        if observation.batch_size == 1:
+        if observation.batch_size == 1 and not has_two_prompts(conditioning):
             return super().sample(observation, noise, num_steps, conditioning=conditioning)
         conditionings = of_rows(conditioning, observation.batch_size)
         rows = [HostRow.of(observation, row) for row in range(observation.batch_size)]
@@ -253,13 +272,19 @@ class BatchRunner(GraphRunner):
 
     def _calls_of(self, forms: Sequence[Form]) -> list[Call]:
         """The calls that a batch of observations of these forms is split into; strict: of those that are captured."""
+        if forms == ["two_prompts"]:
+            return [(0, [0])]
         if len(forms) == 1:
             return [(1, [0])]
         calls: list[Call] = []
         for form, rows in plan.groups(forms):
-            for size in [1] * len(rows) if form == "solver" else self._split(len(rows), form):
+            if form in ("solver", "two_prompts"):
+                calls += [(1 if form == "solver" else 0, [row]) for row in rows]
+                continue
+            for size in self._split(len(rows), form):
                 calls.append((size, rows[:size]))
                 rows = rows[size:]
+        assert sum(len(rows) for _, rows in calls) == len(forms), forms
         return calls
 
     def _split(self, count: int, form: Form) -> list[int]:

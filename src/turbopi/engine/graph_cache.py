@@ -112,8 +112,8 @@ class GraphCache:
     def batch_sizes(self, form: Form) -> frozenset[int]:
         """Observations of the batched calls that are captured with a loop of this form."""
         if form not in self._batch_sizes:
-            keys = (key for key in self.entries if key.batch > 1 and key.loop is not None and key.loop.form == form)
-            self._batch_sizes[form] = frozenset(key.batch for key in keys)
+            loops = ((key, key.loop) for key in self.entries if key.batch > 1 and not key.two_prompts)
+            self._batch_sizes[form] = frozenset(key.batch for key, loop in loops if loop and loop.form == form)
         return self._batch_sizes[form]
 
     def describe(self) -> dict[str, Any]:

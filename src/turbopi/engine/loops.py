@@ -118,7 +118,7 @@ def loop_of_call(
     *,
     times_by_token: bool = False,
 ) -> Loop:
-    """The loop of one observation's call. Raises ObservationError for a conditioning that doesn't fit it.
+    """The loop of one observation's call, by one prompt or two. Raises ObservationError for one that doesn't fit.
 
     A conditioned loop with the config's own grid of times, and 0, serves all calls that have no others, whichever
     actions are held.
@@ -128,7 +128,7 @@ def loop_of_call(
     if conditioning is None:
         return EulerLoop(num_steps, horizon)
     conditioning.check(num_steps, horizon, config.action_dim)
-    form, integration = conditioning.form, conditioning.integration
+    form, integration = conditioning.one_prompt.form, conditioning.integration
     if form == "plain":
         return EulerLoop(num_steps, horizon)
     if form == "solver" and integration is not None and not (integration.is_euler and times_by_token):
@@ -140,7 +140,7 @@ def loop_of_call(
 
 
 def batch_form(conditioning: Conditioning | None) -> Form:
-    """What an observation with this conditioning needs of a batched loop. "solver": it runs alone."""
+    """What an observation with this conditioning needs of a batched loop. "solver", "two_prompts": it runs alone."""
     if conditioning is None:
         return "plain"
     form, integration = conditioning.form, conditioning.integration
@@ -155,7 +155,7 @@ def loop_of_batch(
     Its times are those of all observations, and openpi's, so that plain observations fit it.
     """
     forms = {batch_form(one) for one in conditionings}
-    assert "solver" not in forms, "a solver's loop has other sums"
+    assert not forms & {"solver", "two_prompts"}, "they have other sums"
     if forms == {"plain"}:
         return EulerLoop(num_steps, horizon)
     own = _own_times(num_steps, config.time_grid)

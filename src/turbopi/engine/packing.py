@@ -30,11 +30,18 @@ def most_tiles(rows: int, batch: int, heads: int) -> int:
 
 
 def pack_rows(
-    cameras: Sequence[int], tokens: Sequence[np.ndarray], *, batch: int, rows: int, per_image: int, heads: int
+    cameras: Sequence[int],
+    tokens: Sequence[np.ndarray],
+    *,
+    batch: int,
+    rows: int,
+    per_image: int,
+    heads: int,
+    same_images: bool = False,
 ) -> Packed:
     """Pack observations with so many images, in the order in which the images come, and prompts int64[tokens].
 
-    Fewer observations than `batch` are followed by empty ones.
+    Fewer observations than `batch` are followed by empty ones. same_images: all have the first one's.
     """
     source = np.full(rows, -1, np.int64)  # padding is token 0
     positions = np.zeros(rows, np.int64)
@@ -48,7 +55,7 @@ def pack_rows(
         source[at + seen : at + length] = -1 - prompt
         positions[at : at + length] = np.arange(length)
         segments[:, i] = at, length
-        at, image_row = at + length, image_row + seen
+        at, image_row = at + length, 0 if same_images else image_row + seen
     segments[0, len(cameras) :] = at
     segments[:, batch] = at, rows - at
     return Packed(source, positions, segments, _tiles(segments, rows, heads))

@@ -4,6 +4,8 @@ One observation's call is two graphs, "vision" of so many cameras, which starts 
 "answer", prefix and all denoising steps, for a bucket of prompt lengths. A batched call is three: "vision", "prefix"
 and "denoise". Its rows are packed, so its sizes are sums over its observations. "resized" is vision of images of any
 size. Nothing is captured anew when images, prompt, state or noise change.
+
+A call of one observation with two prompts is a batched call of two observations that have the same images.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,6 +30,7 @@ class GraphKey(NamedTuple):
     float_images: bool  # LeRobot's resizing leaves the uint8 grid
     slots: int = 0  # prompt tokens of all observations, with padding; 0: the graph is for any
     loop: Loop | None = None  # None: the graph is for any
+    two_prompts: bool = False  # of one observation: then `images` are counted once
 
     @property
     def vision(self) -> "GraphKey":
@@ -35,7 +38,9 @@ class GraphKey(NamedTuple):
         return GraphKey("vision", *self[1:4])
 
     def __str__(self) -> str:
-        what = f"{self.images} cameras" if self.batch == 1 else f"{self.batch} observations with {self.images} images"
+        what = f"{self.batch} observations with {self.images} images"
+        if self.batch == 1 or self.two_prompts:
+            what = f"{self.images} cameras" + (", two prompts" if self.two_prompts else "")
         slots = f" + {self.slots} tokens" if self.slots else ""
         return f"{what}{slots}" + ("" if self.loop is None else f", {self.loop}")
 
@@ -57,7 +62,14 @@ def batch_slots(batch: int, tokens: Iterable[int]) -> int:
 
 
 def warm_graphs(
-    batch: int, images: int, float_images: bool, loop: Loop, most_tokens: int, *, resizes: bool
+    batch: int,
+    images: int,
+    float_images: bool,
+    loop: Loop,
+    most_tokens: int,
+    *,
+    resizes: bool,
+    two_prompts: bool = False,
 ) -> Iterator[GraphKey]:
     """What warm-up captures for a call of so many observations, for prompts of every length up to `most_tokens`."""
     sizes = (batch, images, float_images)
@@ -69,20 +81,20 @@ def warm_graphs(
     if batch == 1:
         yield from (GraphKey("answer", *sizes, one, loop) for one in slots)
     else:
-        yield from (GraphKey("prefix", *sizes, one) for one in slots)
-        yield GraphKey("denoise", *sizes, loop=loop)
+        yield from (GraphKey("prefix", *sizes, one, two_prompts=two_prompts) for one in slots)
+        yield GraphKey("denoise", *sizes, loop=loop, two_prompts=two_prompts)
 
 
 def groups(forms: Sequence[Form]) -> Iterator[tuple[Form, list[int]]]:
     """Which observations may share calls, and the form of their loop.
 
     Those with times, held actions or identity guidance by token run together with plain ones; those guided by the true
-    Jacobian together with each other; those with another solver's sums alone.
+    Jacobian together with each other; those with another solver's sums, or two prompts, alone.
     """
     by_token = [row for row, form in enumerate(forms) if form in ("plain", "tokens")]
     if by_token:
         yield "tokens" if "tokens" in forms else "plain", by_token
-    for form in ("jacobian", "solver"):
+    for form in ("jacobian", "solver", "two_prompts"):
         if rows := [row for row, one in enumerate(forms) if one == form]:
             yield form, rows
 
@@ -130,6 +142,9 @@ def cold_call(
 def cold_graph(name: str, key: GraphKey, captured: Iterable[GraphKey]) -> ObservationError:
     """`cold_call` for a graph that isn't captured."""
     needs, conditioned = str(key._replace(slots=0)), key.loop is not None and key.loop.form != "plain"
+    if key.two_prompts:
+        others = (str(one._replace(slots=0)) for one in captured if one.two_prompts and one.part == key.part)
+        return cold_call(name, f"{needs} (give the policy its guidance, so)", others, conditioned=conditioned)
     if key.batch > 1:
         warm = batches(captured)
         return cold_call(name, needs, warm, conditioned=conditioned, batches=key.batch)
@@ -140,12 +155,12 @@ def cold_graph(name: str, key: GraphKey, captured: Iterable[GraphKey]) -> Observ
 
 def singles(captured: Iterable[GraphKey]) -> list[str]:
     """The calls of one observation that are captured, in words."""
-    return _in_words(key for key in captured if key.batch == 1)
+    return _in_words(key for key in captured if key.batch == 1 or key.two_prompts)
 
 
 def batches(captured: Iterable[GraphKey]) -> list[str]:
     """The batched calls that are captured, in words."""
-    return _in_words(key for key in captured if key.batch > 1)
+    return _in_words(key for key in captured if key.batch > 1 and not key.two_prompts)
 
 
 def _in_words(keys: Iterable[GraphKey]) -> list[str]:

@@ -80,7 +80,7 @@ class GraphRunner:
     """
 
     name: ClassVar[str]
-    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "two_prompts")
     strict = False
 
     def __init__(
@@ -116,13 +116,15 @@ class GraphRunner:
             return
         self._check_cameras(cameras)
         actions = self.config.action_horizon if horizon is None else horizon
-        self._warm(1, cameras, float_images, self._loop(conditioning, num_steps, actions))
+        two = conditioning is not None and conditioning.prompt is not None
+        self._warm(2 if two else 1, cameras, float_images, self._loop(conditioning, num_steps, actions), two)
 
-    def _warm(self, batch: int, images: int, float_images: bool, loop: Loop) -> None:
+    def _warm(self, batch: int, images: int, float_images: bool, loop: Loop, two_prompts: bool = False) -> None:
         resizes, most = self._ops.resize_images is not None, self.config.max_prompt_tokens
         self._warming = True
         try:
-            for key in plan.warm_graphs(batch, images, float_images, loop, most, resizes=resizes):
+            sizes = batch, images, float_images, loop, most
+            for key in plan.warm_graphs(*sizes, resizes=resizes, two_prompts=two_prompts):
                 self._graph(key)
         finally:
             self._warming = False
@@ -241,6 +243,7 @@ class GraphRunner:
     ) -> tuple[Graph, StaticCall]:
         """Replay a part behind vision, "prefix" or the whole "answer", on one row and noise float32[H, action_dim]."""
         self._check_turn(begun)
+        self._check_one_prompt(conditioning)
         self._check_tokens(begun.cameras, len(tokens))
         loop = self._loop(conditioning, num_steps, len(noise))
         with self._explaining():
@@ -279,6 +282,10 @@ class GraphRunner:
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
                 f"{cameras} and {tokens}"
             )
+
+    def _check_one_prompt(self, conditioning: Conditioning | None) -> None:
+        if conditioning is not None and conditioning.prompt is not None:
+            raise BackendError(f"{self.name} computes two prompts in `sample` and in batches begun as such alone")
 
     def _check_turn(self, begun: object) -> None:
         """Raise BackendError for what was finished, or whose images were overwritten by a later observation's."""
@@ -323,6 +330,7 @@ class GraphRunner:
         cameras = min(length // per_image, MAX_CAMERAS)
         self._check_tokens(cameras, length - cameras * per_image)
         one = of_rows(conditioning, 1)[0]
+        self._check_one_prompt(one)
         loop = self._loop(one, num_steps, noise.shape[1])
         graph, call = self._graph(GraphKey("denoise", 1, cameras, False, bucket(length - cameras * per_image), loop))
         for ours, given in ((call.cache_k, cache.k), (call.cache_v, cache.v)):

@@ -1,19 +1,19 @@
 """One more token of a model that writes its actions as tokens, by kernels/portable/token.py: six launches a layer.
 
-It computes `Pi0FastModel.step` in the same buffers, with fewer roundings.
+It computes `Writer.step` in the same buffers, with fewer roundings.
 """
 
 import torch
 import triton
 from torch import Tensor, nn
 
-from turbopi.config import Pi0FastConfig
+from turbopi.config import ModelConfig, Pi0FastConfig
 from turbopi.kernels.portable import token as kernels
+from turbopi.models.pi0.decoding import Decoding, Writer
 from turbopi.models.pi0.layers import rope_tables
-from turbopi.models.pi0_fast.reference import Decoding, Pi0FastModel
 
 
-def refuses(config: Pi0FastConfig) -> str | None:
+def refuses(config: Pi0FastConfig | ModelConfig) -> str | None:
     """Why a model of these sizes isn't for these kernels; None: it is."""
     text = config.vlm
     if text.num_kv_heads != 1:
@@ -29,7 +29,7 @@ class JoinedWeights:
     """Each layer's projections to queries, keys and values in one matrix, of which the model's own become views."""
 
     @torch.no_grad()
-    def __init__(self, model: Pi0FastModel) -> None:
+    def __init__(self, model: Writer) -> None:
         self.of_layers: list[Tensor] = []
         for layer in model.vlm.layers:
             own = [getattr(layer.self_attn, f"{name}_proj") for name in "qkv"]
@@ -40,10 +40,10 @@ class JoinedWeights:
 
 
 class TokenStep:
-    """Writes the next id of one observation: call it behind `model.begin(observation, decoding)`."""
+    """Writes the next id of one observation: call it behind `model.read_prefix(decoding, …)`."""
 
-    def __init__(self, model: Pi0FastModel, joined: JoinedWeights, decoding: Decoding) -> None:
-        config, text, device = model.config, model.config.vlm, model.device
+    def __init__(self, model: Writer, joined: JoinedWeights, decoding: Decoding) -> None:
+        config, text, device = model.config, model.config.vlm, decoding.ids.device
         self._model, self._joined, self._decoding = model, joined, decoding
         places = decoding.valid.shape[1]
         positions = torch.arange(places + 2, device=device)[None]
@@ -74,6 +74,8 @@ class TokenStep:
             up = gated.up_proj.weight
             kernels.row_product(row, gated.gate_proj.weight, self._hidden, norm=norm, eps=eps, beside=up)
             kernels.row_product(self._hidden, gated.down_proj.weight, row, add=True)
-        kernels.row_product(row, vlm.embed_tokens.weight, of.logits, norm=vlm.norm, eps=eps)
+        kernels.row_product(row, self._model.head, of.logits, norm=vlm.norm, eps=eps)
+        for first, behind in self._model.never:
+            of.logits[:, first:behind] = -torch.inf
         counters = of.chosen, of.ids, of.count, of.place, of.position
         kernels.choose(of.logits, self._best, self._where, *counters, of.ends, self._ended)

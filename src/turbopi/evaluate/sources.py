@@ -104,7 +104,8 @@ class LocalPolicy:
         self.real_time = offered(about)
         self.identity: dict[str, object] = {"weights": weights, "calibration": calibration_of(about)}
         self.identity |= {name: about.get(name) for name in names}
-        openpis = {"solver": "euler", "time_grid": "uniform"}  # not told, as runs of before that were an option don't
+        # what isn't told, as by runs from before it was an option, is openpi's
+        openpis = {"solver": "euler", "time_grid": "uniform", "guidance": None, "guidance_tag": None}
         self.identity |= {name: about[name] for name, usual in openpis.items() if about.get(name, usual) != usual}
         default = f"{about.get('backend')} {about.get('precision')} {denoising(about)}"
         self.label = label or default

@@ -21,17 +21,21 @@ class Pieces(Protocol):
     def vocab_size(self) -> int: ...
 
 
-class AnswerReader(Protocol):
-    """What makes actions of the ids that a model wrote.
+class Ending(Protocol):
+    """When an answer that is written id by id is over.
 
-    ends  ids at which an answer may be over; `over` decides it
+    ends  ids at which it may be; `over` decides
     """
 
     @property
     def ends(self) -> Sequence[int]: ...
 
     def over(self, ids: Sequence[int]) -> bool:
-        """Whether what follows these ids, the last of which is one of `ends`, changes no action."""
+        """Whether an answer is over behind these ids, the last of which is one of `ends`."""
+
+
+class AnswerReader(Ending, Protocol):
+    """What makes actions of the ids that a model wrote. What follows an answer's end changes no action."""
 
     def actions(self, ids: Sequence[int]) -> NDArray[np.float32]:
         """float32[H, action_dim], normalised. Raises ActionError for a broken answer."""

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -141,6 +142,27 @@ class PastObservation(Observation):
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Observation:
         return PastObservation(*(change(getattr(self, name)) for name in _TENSORS), past=self.past.each(change))
+
+
+@dataclass(frozen=True)
+class SeenObservation(Observation):
+    """One observation whose images are embedded already, or whose prompt is causal in part.
+
+    seen    what the reference's `embed_cameras` returned, or what a writer keeps of it; None: it is still to be done
+    causal  bool[1, P]  tokens that see what is before them, and that nothing before them sees; None: none is
+    """
+
+    seen: Any = field(default=None, kw_only=True)
+    causal: Tensor | None = field(default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, observation: Observation, seen: Any = None, causal: Tensor | None = None) -> "SeenObservation":
+        assert observation.batch_size == 1
+        return cls(*(getattr(observation, name) for name in _TENSORS), seen=seen, causal=causal)
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> Observation:
+        causal = None if self.causal is None else change(self.causal)
+        return SeenObservation(*(change(getattr(self, name)) for name in _TENSORS), seen=self.seen, causal=causal)
 
 
 def past_of(observation: Observation) -> Past:

@@ -11,7 +11,7 @@ from turbopi.config import LIMITS, GridName, PolicyConfig, Solver, TimeGrid
 from turbopi.engine.graph_cache import MOST_LOOPS, MOST_STEPS, fit
 from turbopi.engine.loops import EulerLoop
 from turbopi.models import family_of
-from turbopi.models.pi0.conditioning import Conditioning
+from turbopi.models.pi0.conditioning import Conditioning, checked_scale
 from turbopi.models.pi0.solvers import (
     Integration,
     checked_grid,
@@ -21,6 +21,7 @@ from turbopi.models.pi0.solvers import (
     intervals,
 )
 from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.reading import shown
 
 MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish
 MAX_HORIZON = LIMITS["action_horizon"]
@@ -47,6 +48,10 @@ def checked_batch(size: int, error: Error) -> int:
     return _checked("the size of a batch", size, MAX_BATCH, error)
 
 
+def checked_tokens(tokens: int, most: int) -> int:
+    return _checked("max_tokens", tokens, most, ObservationError)
+
+
 def _checked(what: str, number: int, most: int, error: Error) -> int:
     whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     if not whole or not 1 <= number <= most:
@@ -58,32 +63,78 @@ def _checked(what: str, number: int, most: int, error: Error) -> int:
 class Denoising:
     """How noise becomes actions: evaluations of the action expert, solver, time grid. A policy's own, or a call's.
 
-    refused  why a model has nothing of the kind: then `steps` are tokens of an answer at most
+    guidance  scale of guidance by the policy's tag (`PromptGuidance`); None: the policy has no tag
+    one_step  weights are distilled for one evaluation, and take no other number
+    refused   why a model has nothing of the kind: then `steps` are tokens of an answer at most
     """
 
     steps: int
     solver: Solver = "euler"
     time_grid: GridName | tuple[float, ...] = "uniform"
+    guidance: float | None = None
+    one_step: bool = False
     refused: str | None = None
 
     @classmethod
     def of(
+        cls,
+        config: PolicyConfig,
+        steps: int | None,
+        solver: Solver | None,
+        time_grid: TimeGrid | None,
+        guidance: float | None = None,
+        tag: str | None = None,
+    ) -> "Denoising":
+        """A policy's: its config's, unless it says otherwise. Raises ConfigError.
+
+        tag  behind the prompt, for guidance by it; with it the scale is 1 unless it is given
+        """
+        if tag is None and guidance is None:
+            return cls._of(config, steps, solver, time_grid)
+        if not (family := family_of(config.model)).planned:
+            raise ConfigError(f"guidance by a prompt's tag is for Pi0.5 and Pi0, not for {family.label}: leave it out")
+        if config.text is not None and config.text.subtasks is not None:
+            raise ConfigError("guidance by a prompt's tag isn't for policies that act on subtasks: leave it out")
+        if tag is None:
+            raise ConfigError(
+                f"guidance={shown(guidance)} was asked for, but nothing says what the policy was trained to follow: "
+                "give guidance_tag=TEXT, too, what its training put behind the prompt"
+            )
+        if not tag.strip():
+            raise ConfigError(f"guidance_tag is {shown(tag)}; it should be what training put behind the prompt")
+        own = cls._of(config, steps, solver, time_grid)
+        return replace(own, guidance=1.0).changed(None, None, None, ConfigError, 1.0 if guidance is None else guidance)
+
+    @classmethod
+    def _of(
         cls, config: PolicyConfig, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None
     ) -> "Denoising":
-        """A policy's: its config's, unless it says otherwise. Raises ConfigError."""
         if (why := family_of(config.model).refuses_flow) is not None:
             model: Any = config.model
             return cls(model.max_decoding_steps, refused=why).changed(steps, solver, time_grid, ConfigError)
         number = checked_steps(config.num_denoising_steps, ConfigError)
-        own = cls(number).changed(None, config.solver, config.solver_grid, ConfigError)
+        own = cls(number, one_step=config.one_step).changed(None, config.solver, config.solver_grid, ConfigError)
         if own.steps != number and intervals(own.solver, number) == intervals(own.solver, own.steps):
             own = replace(own, steps=number)  # fits the grid's times, too
         return own.changed(steps, solver, time_grid, ConfigError)
 
     def changed(
-        self, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None, error: Error
+        self,
+        steps: int | None,
+        solver: Solver | None,
+        time_grid: TimeGrid | None,
+        error: Error,
+        guidance: float | None = None,
     ) -> "Denoising":
         """The same but for what isn't None. Times bring their number of steps, unless it is given, too."""
+        if guidance is not None:
+            if self.guidance is None:
+                raise error("guidance was given, but this policy has no tag: give guidance_tag=TEXT where it is made")
+            try:
+                scale = checked_scale(guidance)
+            except ObservationError as wrong:
+                raise error(str(wrong)) from None
+            return replace(self, guidance=scale).changed(steps, solver, time_grid, error)
         if steps is None and solver is None and time_grid is None:
             return self
         if self.refused is not None:
@@ -105,7 +156,9 @@ class Denoising:
                     f"{count} steps of solver {chosen!r} are {intervals(chosen, count)} intervals, but the time grid "
                     f"has {len(grid) - 1}: give {fits} steps, leave them out, or take time grid 'uniform'"
                 )
-        return Denoising(count, chosen, grid)
+        if self.one_step and count != 1:
+            raise error(f"{count} denoising steps were asked for, but these weights were distilled for one alone")
+        return replace(self, steps=count, solver=chosen, time_grid=grid)
 
     def of_call(
         self,
@@ -113,6 +166,7 @@ class Denoising:
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
         conditioning: Conditioning | None = None,
+        guidance: float | None = None,
     ) -> "Denoising":
         """A call's. A conditioning with times or a solver of its own brings its steps. Raises ObservationError."""
         if steps is None and conditioning is not None:
@@ -120,7 +174,17 @@ class Denoising:
                 steps = conditioning.integration.evaluations
             elif conditioning.tokens is not None:
                 steps = len(conditioning.tokens.times)
-        return self.changed(steps, solver, time_grid, ObservationError)
+        return self.changed(steps, solver, time_grid, ObservationError, guidance)
+
+    @property
+    def two_prompts(self) -> bool:
+        """Whether both the prompt and the one with the tag are computed: at 0 and 1 one of them counts for nothing."""
+        return self.guidance not in (None, 0, 1)
+
+    @property
+    def runs_together(self) -> bool:
+        """Whether backends that run batches run observations of such calls together."""
+        return not self.two_prompts and (self.integration is None or self.integration.is_euler)
 
     @cached_property
     def integration(self) -> Integration | None:
@@ -139,7 +203,8 @@ class Denoising:
         if self.refused is not None:
             return {"num_denoising_steps": 0, "max_decoding_steps": self.steps}
         grid = self.time_grid if isinstance(self.time_grid, str) else list(self.time_grid)
-        return {"num_denoising_steps": self.steps, "solver": self.solver, "time_grid": grid}
+        guided = {} if self.guidance is None else {"guidance": self.guidance}
+        return {"num_denoising_steps": self.steps, "solver": self.solver, "time_grid": grid, **guided}
 
 
 def several(what: str, given: Numbers, default: Sequence[int], check: Callable[[int, Error], int]) -> list[int]:

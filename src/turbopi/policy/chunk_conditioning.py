@@ -14,13 +14,14 @@ from turbopi.models.pi0.conditioning import (
     Conditionings,
     Form,
     Guidance,
+    PromptGuidance,
     TokenTimes,
     guidance_strength,
     row_named,
 )
 from turbopi.models.pi0.solvers import Integration
 from turbopi.preprocess.pipeline import Pipeline
-from turbopi.realtime.running_chunk import FORMS, JoinMode, RunningChunk
+from turbopi.realtime.running_chunk import FORMS, WARM_START, JoinMode, RunningChunk
 from turbopi.support.errors import ConfigError, ObservationError
 
 Loop = tuple[int, int]  # denoising steps, action horizon
@@ -36,17 +37,24 @@ class Joins:
     steps: int
     horizon: int
     integration: Integration | None = None
+    guidance: float = 0.0  # as `Incoming`'s
+
+    @property
+    def two_prompts(self) -> bool:
+        return self.guidance not in (0, 1)
 
     @property
     def forms(self) -> list[Form]:
         """What each observation's denoising loop must be able to do, as far as a batch is concerned."""
-        return [self._form(*row) for row in self.rows]
+        return ["two_prompts"] * len(self.rows) if self.two_prompts else [self._form(*row) for row in self.rows]
 
     def _form(self, conditioning: Conditioning | None, chunk: RunningChunk | None) -> Form:
         if chunk is None:
             return batch_form(conditioning)
         if chunk.mode == "rtc_trained" and chunk.delay == 0:  # nothing is held
             return batch_form(integrated(None, self.integration))
+        if chunk.mode == "warm_start":
+            return batch_form(Conditioning(integration=warmed(self.integration, self.steps)))
         return FORMS[chunk.mode]
 
 
@@ -62,19 +70,25 @@ class ChunkConditioning:
         pipeline: Pipeline,
         backend: Backend | type[Backend],
         integration: Integration | None = None,
+        two_prompts: bool = False,
     ) -> None:
         self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
-        self._integration = integration
-        if integration is not None and (why := backend.refuses_form("solver")) is not None:
-            raise ConfigError(why)
+        self._integration, self._two_prompts = integration, two_prompts
+        needed: dict[Form, bool] = {"solver": integration is not None, "two_prompts": two_prompts}
+        for form, wanted in needed.items():
+            if wanted and (why := backend.refuses_form(form)) is not None:
+                raise ConfigError(why)
 
     @property
     def modes(self) -> tuple[JoinMode, ...]:
         """What `RunningChunk`s may ask of this policy."""
+        able, trained = set(self._backend.forms), self._config.real_time.trained_max_delay > 0
+        if self._two_prompts and "two_prompts_jacobian" not in able:
+            able.discard("jacobian")
         if self._integration is not None and not self._integration.is_euler:
-            return ()  # see `Conditioning`
-        able, trained = self._backend.forms, self._config.real_time.trained_max_delay > 0
-        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
+            able &= {"solver"}  # see `Conditioning`
+        lacking = {"rtc_trained": not trained, "warm_start": self._config.one_step}
+        return tuple(mode for mode, form in FORMS.items() if form in able and not lacking.get(mode, False))
 
     def checked(
         self,
@@ -83,17 +97,25 @@ class ChunkConditioning:
         steps: int,
         horizon: int,
         integration: Integration | None = None,
+        guidance: float | None = None,
     ) -> Joins:
         """What each observation of a call is to join, and how it is integrated.
 
         Raises ObservationError; of several observations it names the row.
         """
+        joins = Joins([], steps, horizon, integration, guidance or 0.0)
+        if joins.two_prompts:
+            self._check_form("two_prompts")
         rows = [self._checked(None, None, steps, horizon, integration)] * len(conditionings)
         for i, (conditioning, chunk) in enumerate(zip(conditionings, previous, strict=True)):
             if conditioning is not None or chunk is not None:
                 with row_named(i, len(conditionings)):
                     rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
-        return Joins(rows, steps, horizon, integration)
+                    if joins.two_prompts and conditioning is not None and conditioning.prompt is not None:
+                        raise ObservationError("guidance was given twice, by the conditioning and by a scale: give one")
+                    jacobian = joins.two_prompts and joins._form(*rows[i]) == "jacobian"
+                    self._check_form("two_prompts_jacobian" if jacobian else "plain")
+        return replace(joins, rows=rows)
 
     def _checked(
         self,
@@ -107,10 +129,10 @@ class ChunkConditioning:
             raise ObservationError("conditioning and previous were both given; give one of them")
         if previous is None:
             conditioning = integrated(conditioning, integration)
-        elif integration is not None and not integration.is_euler:
+        elif integration is not None and not integration.is_euler and previous.mode != "warm_start":
             raise ObservationError(
                 f"a running chunk and solver {integration.solver!r} were both given: chunks join by Euler's steps, so "
-                "take solver 'euler', whose time grid may be any, or leave out previous"
+                "take solver 'euler', whose time grid may be any, mode warm_start, or leave out previous"
             )
         if conditioning is not None:
             conditioning.check(steps, horizon, self._model.action_dim)
@@ -122,23 +144,45 @@ class ChunkConditioning:
                 options = replace(options, execution_horizon=horizon - end if end < horizon else None)
             previous = previous.completed(horizon, self._model.action_dim, relative=relative, options=options)
             self._check_form(FORMS[previous.mode])
+            if previous.mode == "warm_start" and self._config.one_step:
+                raise ObservationError(
+                    "these weights were distilled for one step from noise alone, so they have no warm start: take "
+                    "another mode, or leave out previous"
+                )
         return conditioning, previous
 
-    def conditioning(self, joins: Joins, states: Sequence[np.ndarray]) -> Conditionings:
+    def conditioning(
+        self, joins: Joins, states: Sequence[np.ndarray], tagged: Sequence[np.ndarray | None]
+    ) -> Conditionings:
         """What the backend is given beside the noise, once the new states are known. Raises ObservationError.
+
+        tagged  of each the second prompt, as `Incoming`'s
 
         None for an ordinary call, else one for all observations, or a list with one for each.
         """
         rows: list[Conditioning | None] = []
-        for i, ((one, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+        for i, ((one, chunk), state, tokens) in enumerate(zip(joins.rows, states, tagged, strict=True)):
             if chunk is not None:
                 with row_named(i, len(states)):
                     one = self._of_chunk(chunk, state, joins)
+            if tokens is not None:
+                one = replace(one or Conditioning(), prompt=PromptGuidance(tokens, joins.guidance))
             rows.append(None if one is None or one.form == "plain" else one)
         return rows[0] if all(one is rows[0] for one in rows) else rows
 
+    def started(self, joins: Joins, states: Sequence[np.ndarray], noise: np.ndarray) -> np.ndarray:
+        """float32[B, H, action_dim]: what the backend is given as noise. Rows with a warm start begin elsewhere."""
+        for row, ((_, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+            if chunk is not None and chunk.mode == "warm_start":
+                left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+                noise = noise.copy()
+                noise[row] = chunk.begun(left_over, noise[row])
+        return noise
+
     def _of_chunk(self, chunk: RunningChunk, state: np.ndarray, joins: Joins) -> Conditioning:
         steps, horizon, integration = joins.steps, joins.horizon, joins.integration
+        if chunk.mode == "warm_start":
+            return Conditioning(integration=warmed(integration, steps))
         left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
         conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
         if integration is not None:
@@ -171,7 +215,11 @@ class ChunkConditioning:
                     f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
                 )
             for loop in loops:
-                requested.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
+                own = integrations(loop[0])
+                if mode == "warm_start":
+                    requested.append((*loop, Conditioning(integration=warmed(own, loop[0]))))
+                else:
+                    requested.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), own)))
         for one in others:
             steps, horizon = one.size(num_steps, self._model.action_horizon)
             try:
@@ -182,11 +230,22 @@ class ChunkConditioning:
             except ObservationError as error:
                 raise ConfigError(f"warm-up: {error}") from None
             requested.append((steps, horizon, one))
-        return requested
+        if not self._two_prompts:
+            return requested
+        example = PromptGuidance(np.zeros(1, np.int64), 2.0)
+        return [(*loop, replace(one or Conditioning(), prompt=example)) for *loop, one in requested]  # type: ignore[misc]
 
     def _check_form(self, form: Form) -> None:
         if (why := self._backend.refuses_form(form)) is not None:
             raise ObservationError(why)
+
+
+def warmed(integration: Integration | None, steps: int) -> Integration:
+    """As an integration, or so many equal Euler steps, from where a warm start begins."""
+    if integration is None:
+        return Integration("euler", tuple(WARM_START * (1 - i / steps) for i in range(steps + 1)))
+    times = tuple(WARM_START * t for t in integration.times)
+    return Integration(integration.solver, times, integration.evaluations)
 
 
 def integrated(conditioning: Conditioning | None, integration: Integration | None) -> Conditioning | None:

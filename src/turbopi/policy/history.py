@@ -15,6 +15,7 @@ import numpy as np
 from turbopi.config import MemoryConfig
 from turbopi.models.observation import ModelInputs, PastInputs
 from turbopi.preprocess.pipeline import Pipeline
+from turbopi.realtime.messages import keeps_episode
 from turbopi.support.errors import ConfigError, ObservationError
 
 PAD = "_is_pad"  # behind a key, as LeRobot's data sets: which of its frames are from before the episode
@@ -22,26 +23,36 @@ PAD = "_is_pad"  # behind a key, as LeRobot's data sets: which of its frames are
 
 def refuse_memory(metadata: Mapping[str, Any], what: str) -> None:
     """Raise ConfigError if a policy of this metadata has memory, which `what` isn't made for."""
-    if "memory" in metadata:
+    if keeps_episode(metadata):
+        why = "has memory" if "memory" in metadata else "acts on subtasks"
         raise ConfigError(
-            f"this policy has memory, and {what} doesn't keep a robot's history. `turbopi infer`, `serve`, `verify`, "
-            "`bench` and `inspect` take it, and so do UnifiedPolicy and the LeRobot plugin"
+            f"this policy {why}, and {what} doesn't keep a robot's history. `turbopi infer`, `serve`, `verify`, "
+            "`bench` and `inspect` take it, and so does UnifiedPolicy"
         )
 
 
-class ObservationHistory:
-    """Of one robot's episode. `UnifiedPolicy.new_history` makes one; calls record into it, one at a time.
+class History:
+    """What a policy keeps of one robot's episode. `UnifiedPolicy.new_history` makes one; calls use it one at a time.
 
     observations  recorded since the episode began
     """
+
+    observations = 0
+
+    def reset(self) -> None:
+        """A new episode: what was recorded is forgotten."""
+        self.observations = 0
+
+
+class ObservationHistory(History):
+    """Of a policy with memory."""
 
     def __init__(self, memory: MemoryConfig) -> None:
         self._memory = memory
         self.reset()
 
     def reset(self) -> None:
-        """A new episode: what was recorded is forgotten."""
-        self.observations = 0
+        super().reset()
         self._images: dict[str, deque[np.ndarray]] = {}  # by camera: of one that was missing, what came
         self._states: deque[np.ndarray] = deque(maxlen=self._memory.length)
 

@@ -29,15 +29,17 @@ from turbopi.policy.call_options import (
     checked_cameras,
     checked_horizon,
     checked_steps,
+    checked_tokens,
     noise_for,
     several,
     warm_loops,
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
-from turbopi.policy.history import ObservationHistory
+from turbopi.policy.history import History, ObservationHistory
 from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
+from turbopi.policy.text import SubtaskHistory, checked_text
 from turbopi.policy.watch import PolicyWatch
 from turbopi.preprocess.answers import reader_of
 from turbopi.preprocess.pipeline import Pipeline
@@ -70,6 +72,11 @@ class UnifiedPolicy:
         solver: "euler", "midpoint", "heun", "ab2" or "exponential" (docs/performance.md). None: the config's.
         time_grid: "uniform", "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1 (noise) to 0,
             which determine the number of steps. None: the config's.
+        guidance_tag: for policies that were trained with and without it (RECAP): the text that training put behind the
+            prompt, such as "Advantage: positive". It goes behind the prompt on a line of its own, and both through the
+            prompt's own clean-up.
+        guidance: scale of classifier-free guidance towards the tag. None: 1, the prompt with the tag alone. 0 is the
+            prompt alone, and any other number up to 100 takes both prompts: docs/performance.md.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache; SmolVLA's in the folder or the Hub's cache (tokenizer.json).
@@ -98,6 +105,8 @@ class UnifiedPolicy:
         num_denoising_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
+        guidance_tag: str | None = None,
         device: str | torch.device = "auto",
         tokenizer: Any = None,
         default_prompt: str | None = None,
@@ -118,10 +127,12 @@ class UnifiedPolicy:
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
         self.config, model = checkpoint.config, checkpoint.config.model
-        self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
+        flow = num_denoising_steps, solver, time_grid, guidance, guidance_tag
+        self._denoising = Denoising.of(self.config, *flow)
         prompt_tokenizer = tokenizer_of(checkpoint, tokenizer)
         reader = reader_of(checkpoint, prompt_tokenizer)
-        self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
+        edges = checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot, guidance_tag
+        self._pipeline = Pipeline(*edges)
         self._checks = Checks(
             self._pipeline,
             checkpoint.norm_stats,
@@ -142,20 +153,26 @@ class UnifiedPolicy:
 
         calibration = for_policy(quantization, precision, checkpoint)
         self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
+        text, writes = self.config.text, self.config.writes_subtasks
         if backend == "auto":  # when all that was given is known to be good
-            backends.qualified(self._device, precision, model, bar=progress)
-            name, why = backends.choose(self._device, precision, model)
+            backends.qualified(self._device, precision, model, bar=progress, writes=writes)
+            name, why = backends.choose(self._device, precision, model, writes=writes)
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
-                name, model, load, device=self._device, precision=precision, quantization=calibration
+                name, model, load, device=self._device, precision=precision, quantization=calibration, writes=writes
             )
+            if text is not None and text.trained and self.backend.writes:
+                head = checkpoint.load_head(self._device, "bf16" if precision == "bf16" else "f32")
+                self.backend.prepare_text(text, head)
         self.backend.strict, self.backend.reader = strict, reader
         self._strict = strict
-        self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, self._denoising.integration)
+        own = self._denoising.integration, self._denoising.two_prompts
+        self._conditioning = ChunkConditioning(self.config, self._pipeline, self.backend, *own)
         self._call = ModelCall(self._pipeline, self._conditioning, self.backend, self._guard, self._checks)
         self._memory = memory_of(model)
-        self._history = None if self._memory is None else ObservationHistory(self._memory)
+        self._acts_on_subtasks = text is not None and text.subtasks is not None
+        self._history = self._make_history()
         self._generator = np.random.default_rng()
         self._backend_reason = why
         self._checkpoint = checkpoint
@@ -169,11 +186,13 @@ class UnifiedPolicy:
         num_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
         horizon: int | None = None,
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
         model_actions: bool = False,
-        history: ObservationHistory | None = None,
+        history: History | None = None,
+        subtask: str | None = None,
         readings: bool = False,
     ) -> dict[str, Any]:
         """One observation to one action chunk.
@@ -183,14 +202,15 @@ class UnifiedPolicy:
             noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. With noise or a seed the result is
                 deterministic.
             seed: of the noise, by `numpy.random.default_rng(seed)`. Without both: fresh noise every call.
-            num_steps, solver, time_grid: for this call only.
+            num_steps, solver, time_grid, guidance: for this call only.
             horizon: actions of the chunk, H, for this call only. None: the config's, which the weights are trained for.
                 A shorter chunk isn't the beginning of a longer one. Engines for one horizon refuse others.
             previous: the previous chunk, which this one continues (docs/real_time.md); modes: `metadata["real_time"]`.
             conditioning: instead of `previous`, exact instructions to the denoising loop (models/pi0/conditioning.py).
                 One with its own times or solver determines the number of steps.
             model_actions: also return what the next call's `previous` needs.
-            history: where memory records `obs` (docs/lerobot.md). None: the policy's own.
+            history: where memory records `obs` (docs/lerobot.md), or a subtask is kept. None: the policy's own.
+            subtask: what the actions are made of, if the policy acts on subtasks (docs/text.md). None: it writes one.
             readings: for a server: what notes are made of, under "reading", instead of them.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
@@ -205,6 +225,8 @@ class UnifiedPolicy:
 
         If there is something to say, also "turbopi/notes" (docs/safety.md), a list of {"kind", "names", "text"}.
 
+        A policy that acts on subtasks adds "subtask", the text that the actions are made of, and `text_ms`.
+
         With `model_actions` also "model_actions": float32[H, action_dim], normalised, and for relative actions
         "anchor": float64[d], the state that they are relative to.
 
@@ -214,9 +236,20 @@ class UnifiedPolicy:
         noises = None if noise is None else [noise]
         own = of_each("conditioning", [conditioning], 1, Conditioning)
         joined = of_each("previous", [previous], 1, RunningChunk)
-        requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
+        requested = self._denoising.of_call(num_steps, solver, time_grid, conditioning, guidance)
         histories = self._histories([self._history if history is None else history])
-        row = [obs], noises, seed, requested, horizon, own, joined, [model_actions], histories
+        row = (
+            [obs],
+            noises,
+            seed,
+            requested,
+            horizon,
+            own,
+            joined,
+            [model_actions],
+            histories,
+            self._subtasks([subtask]),
+        )
         return self._infer(*row, hand_over=readings, one_robot=True)[0]
 
     def infer_batch(
@@ -228,11 +261,13 @@ class UnifiedPolicy:
         num_steps: int | None = None,
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
+        guidance: float | None = None,
         horizon: int | None = None,
         conditioning: Sequence[Conditioning | None] | None = None,
         previous: Sequence[RunningChunk | None] | None = None,
         model_actions: bool | Sequence[bool] = False,
-        histories: Sequence[ObservationHistory] | None = None,
+        histories: Sequence[History] | None = None,
+        subtasks: Sequence[str | None] | None = None,
         readings: bool = False,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
@@ -240,7 +275,7 @@ class UnifiedPolicy:
         `noise` is [B, H, action_dim]; `seed` is the first row's, the next row has the next number, or one for each row.
         `conditioning` and `previous` have one entry for each row, None for an unconditioned one; `model_actions` is one
         flag or one for each row. All rows take the same number of denoising steps. Memory needs one of
-        `histories` for each row. Errors name the row.
+        `histories` for each row, and so does acting on subtasks; `subtasks` may give some. Errors name the row.
 
         If `runs_batches`, the backend computes 1, 2, 4, 8 or 16 observations together and splits other numbers; else
         one by one, as with another solver than Euler's. Cameras and prompts may differ. Rows with fixed actions,
@@ -251,12 +286,13 @@ class UnifiedPolicy:
         rows = len(observations)
         own = of_each("conditioning", conditioning, rows, Conditioning)
         bringing = next((one for one in own if one is not None and one.brings_steps), None)
-        requested = self._denoising.of_call(num_steps, solver, time_grid, bringing)
+        requested = self._denoising.of_call(num_steps, solver, time_grid, bringing, guidance)
         joined, reported = (
             of_each("previous", previous, rows, RunningChunk),
             flags("model_actions", model_actions, rows),
         )
-        several = observations, noise, seed, requested, horizon, own, joined, reported, self._histories(histories, rows)
+        kept = self._histories(histories, rows), self._subtasks([None] * rows if subtasks is None else subtasks, rows)
+        several = observations, noise, seed, requested, horizon, own, joined, reported, *kept
         return self._infer(*several, hand_over=readings, one_robot=False)
 
     def _infer(
@@ -269,19 +305,21 @@ class UnifiedPolicy:
         conditionings: Sequence[Conditioning | None],
         previous: Sequence[RunningChunk | None],
         model_actions: Sequence[bool],
-        histories: Sequence[ObservationHistory],
+        histories: Sequence[History],
+        subtasks: Sequence[str | None],
         *,
         hand_over: bool,
         one_robot: bool,
     ) -> list[dict[str, Any]]:
-        """`infer_batch`; the last four before the flags have one for each observation. Flags: `PolicyWatch.report`."""
+        """`infer_batch`; the last five before the flags have one for each observation. Flags: `PolicyWatch.report`."""
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
-        joins = self._conditioning.checked(conditionings, previous, steps, actions, denoising.integration)
-        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed), histories)
+        how = denoising.integration, denoising.guidance
+        joins = self._conditioning.checked(conditionings, previous, steps, actions, *how)
+        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed), histories, subtasks)
         chunks, readings = self._checks.judge(ran.sample.actions.numpy(), ran.readings)
         results = self._pipeline.after_all(chunks, ran.states)
         self._watch.report(results, readings, hand_over=hand_over, one_robot=one_robot)
@@ -290,8 +328,26 @@ class UnifiedPolicy:
                 result["model_actions"] = chunks[row].copy()
                 if (anchor := self._pipeline.anchor(ran.states[row])) is not None:
                     result["anchor"] = anchor
+        for result, text in zip(results, ran.subtasks, strict=False):
+            result["subtask"] = text
         timing = ran.sample.timing(start, ran.requested, ran.infer_start, ran.infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
+
+    def generate(self, obs: Mapping[str, Any], *, prompt: str | None = None, max_tokens: int | None = None) -> str:
+        """The text that the policy's language head writes to an observation, greedily; "" if that is nothing.
+
+            policy.generate(observation)  # "pick up the cup"
+
+        prompt      in place of the observation's: what fills the {prompt} of the policy's template
+        max_tokens  where an answer is cut that isn't over: 1 to the policy's own limit, which is the default
+
+        Actions have none of it, and nothing is kept. Raises ObservationError for wrong arguments, and for a policy
+        that writes no text: where that is known from, docs/text.md says.
+        """
+        self._guard.refuse_if_lost()
+        if max_tokens is not None and self.config.text is not None:
+            checked_tokens(max_tokens, self.config.text.max_tokens)
+        return self._call.write(obs, checked_text("prompt", prompt), max_tokens)
 
     def submit(
         self,
@@ -316,8 +372,10 @@ class UnifiedPolicy:
             return done
         start = time.perf_counter()
         self._guard.refuse_if_lost()
+        if self._acts_on_subtasks:
+            raise ObservationError(f"{self.config.name} acts on subtasks, which `submit` doesn't take: call `infer`")
         actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
-        seen = self._pipeline.see(obs)
+        seen = self._pipeline.see(obs, guidance=self._denoising.guidance or 0.0)
         inputs, reading = self._pipeline.complete(seen), self._checks.reading(seen)
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         requested = time.perf_counter()
@@ -352,12 +410,14 @@ class UnifiedPolicy:
         return other
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before, memory is empty."""
+        """A new episode, as openpi's `BasePolicy.reset`: notes compare it with nothing before, memory is empty, and the
+        next chunk has a new subtask.
+        """
         self._watch.reset()
         if self._history is not None:
             self._history.reset()
 
-    def observe(self, obs: Mapping[str, Any], *, history: ObservationHistory | None = None) -> None:
+    def observe(self, obs: Mapping[str, Any], *, history: History | None = None) -> None:
         """Record an observation, as `infer` does, without computing. Raises ObservationError without memory."""
         if self._memory is None:
             raise ObservationError(f"{self.config.name} has no memory: it sees the observation of `infer` alone")
@@ -368,27 +428,40 @@ class UnifiedPolicy:
         with self._call.lock:
             self._call.recorded(frames, into)
 
-    def new_history(self) -> ObservationHistory:
-        """Of another robot. Raises ObservationError without memory."""
-        if self._memory is None:
+    def new_history(self) -> History:
+        """Of another robot. Raises ObservationError for a policy without memory that acts on no subtasks."""
+        if (made := self._make_history()) is None:
             raise ObservationError(f"{self.config.name} has no memory, so it takes no history")
-        return ObservationHistory(self._memory)
+        return made
 
-    def _histories(
-        self, given: Sequence[ObservationHistory | None] | None, rows: int = 1
-    ) -> Sequence[ObservationHistory]:
-        """One for each row of a policy with memory, none for others. Raises ObservationError."""
+    def _make_history(self) -> History | None:
+        if self._memory is not None:
+            return ObservationHistory(self._memory)
+        return SubtaskHistory() if self._acts_on_subtasks else None
+
+    def _histories(self, given: Sequence[History | None] | None, rows: int = 1) -> Sequence[History]:
+        """One for each row of a policy that keeps something of an episode, none for others. Raises ObservationError."""
         each = [] if given is None else [one for one in given if one is not None]
-        if self._memory is None:
+        if self._history is None:
             if each:
                 raise ObservationError(f"history was given, but {self.config.name} has no memory: leave it out")
             return []
-        if not all(isinstance(one, ObservationHistory) for one in each) or len({id(one) for one in each}) != rows:
+        if not all(isinstance(one, type(self._history)) for one in each) or len({id(one) for one in each}) != rows:
             raise ObservationError(
                 f"a policy with memory needs a history for each of {rows} robots, a different one: give `histories`, "
                 "made by `new_history`"
             )
         return each
+
+    def _subtasks(self, given: Sequence[str | None], rows: int = 1) -> Sequence[str | None]:
+        """One, or None, for each row of a policy that acts on subtasks, nothing for others. Raises ObservationError."""
+        if not self._acts_on_subtasks:
+            if any(one is not None for one in given):
+                raise ObservationError(f"subtask was given, but {self.config.name} acts on none: leave it out")
+            return ()
+        if isinstance(given, str) or len(given) != rows:
+            raise ObservationError(f"subtasks has {len(given)} entries for {rows} observations: give one for each")
+        return [checked_text("subtask", one) for one in given]
 
     def warmup(
         self,
@@ -452,14 +525,24 @@ class UnifiedPolicy:
 
     def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
         try:
-            history = None if self._memory is None else self.new_history()
-            self.infer(example, seed=0, num_steps=num_steps, horizon=horizon, history=history)
+            subtask = "warm up" if self._acts_on_subtasks else None
+            if self.backend.writer is not None:
+                self.generate(example, max_tokens=2)
+            self.infer(
+                example,
+                seed=0,
+                num_steps=num_steps,
+                horizon=horizon,
+                history=self._make_history(),
+                subtask=subtask,
+            )
         except ActionError as error:  # of a random observation: whether the weights are at fault, real ones show
             logger.warning("warm-up: %s", error)
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
         """The model's inputs for an episode's first observation. Raises ObservationError if it can't be used."""
-        return self._call.recorded(self._call.see(obs), None if self._memory is None else self.new_history())
+        frames = self._call.see(obs, self._denoising.guidance or 0.0)
+        return self._call.recorded(frames, None if self._memory is None else self.new_history())
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
         """A random observation in this robot's keys, shapes and dtypes."""
@@ -473,8 +556,7 @@ class UnifiedPolicy:
     @property
     def runs_batches(self) -> bool:
         """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
-        integration = self._denoising.integration
-        return self.backend.runs_batches and (integration is None or integration.is_euler)
+        return self.backend.runs_batches and self._denoising.runs_together
 
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:
@@ -491,8 +573,8 @@ class UnifiedPolicy:
 
     @property
     def reads_in_place(self) -> bool:
-        """To the server: whether images are copied by the end of a call, and none is kept, as for a memory."""
-        return self._memory is None
+        """To the server: whether images are copied by the end of a call, and none is kept, as of an episode."""
+        return self._history is None
 
     @property
     def pipelined(self) -> bool:
@@ -529,11 +611,29 @@ class UnifiedPolicy:
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
             "real_time": {"modes": list(self._conditioning.modes), **dataclasses.asdict(self.config.real_time)},
-            **({} if self._history is None else {"memory": self._history.describe(self._pipeline)}),
+            **(
+                {"memory": self._history.describe(self._pipeline)}
+                if isinstance(self._history, ObservationHistory)
+                else {}
+            ),
+            **self._about_text,
             **self._loading,
             **self._pipeline.metadata,
             "features": self._checks.features,
         }
+
+    @property
+    def _about_text(self) -> dict[str, Any]:
+        """Only of a policy that writes text, or acts on subtasks."""
+        text = self.config.text
+        if text is None:
+            return {}
+        about: dict[str, Any] = {}
+        if self.backend.writer is not None:
+            about["text"] = {"template": text.template, "max_tokens": text.max_tokens}
+        if text.subtasks is not None:
+            about["subtasks"] = dataclasses.asdict(text.subtasks) | {"written": self.backend.writer is not None}
+        return about
 
     def _horizon(self, horizon: int | None) -> int:
         """A call's. Raises ObservationError."""

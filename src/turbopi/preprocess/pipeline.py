@@ -25,7 +25,8 @@ from turbopi.preprocess.robot_checks import (
     read_observation,
     width_of_outputs,
 )
-from turbopi.preprocess.tokenizer import PromptTokenizer
+from turbopi.preprocess.text_prompts import action_text
+from turbopi.preprocess.tokenizer import PromptTokenizer, Write
 from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.aloha import smolvla_actions, smolvla_state
 from turbopi.robots.base import Example, all_finite, keys_of, listed, read_prompt, read_state
@@ -42,17 +43,21 @@ class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
     resize          False: images in uint8 keep their size, for a backend that resizes them
+    guidance        scale of guidance by the pipeline's tag: 0 is the prompt alone, 1 the one with the tag alone
     cameras         the model's, in its order: keys of the robot's images
     images        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
     sent            of each camera, whether the observation has it
     valid           of each camera, whether the model sees an image of it
+    prompt_state    float64[s]  normalised, as prompts have it
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
+    tagged          int64[P]  valid ids of the prompt with the tag, if both prompts count
     """
 
     observation: Mapping[str, object]
     resize: bool = True
+    guidance: float = 0.0
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
     cameras: tuple[str, ...] = field(init=False)
@@ -60,10 +65,12 @@ class Incoming:
     sent: list[bool] = field(init=False)
     valid: list[bool] = field(init=False)
 
+    prompt_state: np.ndarray = field(init=False)
     state: np.ndarray = field(init=False)
     model_state: np.ndarray = field(init=False)
     tokens: np.ndarray = field(init=False)
     token_mask: np.ndarray = field(init=False)
+    tagged: np.ndarray | None = None
 
     @property
     def image_mask(self) -> np.ndarray:  # bool[C]
@@ -88,6 +95,7 @@ class Pipeline:
     robot           instead of the config's: a name, a description's path, or an object. The config's options are for
                     the robot that it names alone
 
+    tag             behind a line of its own in guided prompts (`PromptGuidance`), which then go the prompt's own way
     write           how the family's prompts are written, where it has rules of its own (`Family.prompt`)
 
     `notes` says what the user had better look at. Raises ConfigError if these don't fit each other. Calls change
@@ -101,8 +109,9 @@ class Pipeline:
         tokenizer: PromptTokenizer,
         default_prompt: str | None = None,
         robot: str | Robot | None = None,
+        tag: str | None = None,
     ) -> None:
-        self.config, self.tokenizer = config, tokenizer
+        self.config, self.tokenizer, self.tag = config, tokenizer, tag
         self.robot = robot_for(config.robot if robot is None else robot, config.robot, config.robot_options)
         prompts = (default_prompt, config.default_prompt, self.robot.default_prompt)
         self.default_prompt = next((prompt for prompt in prompts if prompt is not None), None)
@@ -116,8 +125,10 @@ class Pipeline:
         scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
         self._adds_raw_state = mask is not None and scaled_by_lerobot
         self._image_shape = (config.model.image_size,) * 2
-        write = family_of(config.model).prompt
-        self.write = None if write is None else functools.partial(write, config.model)
+        write, acts_on_subtasks = family_of(config.model).prompt, config.text is not None and config.text.subtasks
+        self.write: Write | None = action_text if acts_on_subtasks else None
+        if write is not None:
+            self.write = functools.partial(write, config.model)
         self._float_images = WAYS[config.image_resize].float_images
         self._black = np.zeros((*self._image_shape, 3), np.uint8) if config.missing_cameras == "black" else None
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
@@ -157,11 +168,11 @@ class Pipeline:
             image[:] = next(camera_images) if valid else black
         return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state)
 
-    def see(self, observation: Mapping[str, object], *, resize: bool = True) -> Incoming:
-        """The first half of `before`: all that vision needs. `read` is the other. `resize`: see `Incoming`."""
+    def see(self, observation: Mapping[str, object], *, resize: bool = True, guidance: float = 0.0) -> Incoming:
+        """The first half of `before`: all that vision needs. `read` is the other. The options: see `Incoming`."""
         if not isinstance(observation, Mapping):
             raise ObservationError(f"an observation is a dict, got {type(observation).__name__}")
-        one = Incoming(observation, resize)
+        one = Incoming(observation, resize, guidance)
         for step in self.before_vision:
             step(one)
         return one
@@ -277,6 +288,8 @@ class Pipeline:
             "robot_action_dim": self._action_width,
             "default_prompt": self.default_prompt,
         }
+        if self.tag is not None:
+            described["guidance_tag"] = self.tag
         if self.robot.reset_pose is not None:
             described["reset_pose"] = list(self.robot.reset_pose)
         if isinstance(self.robot, LeRobot):
@@ -334,16 +347,22 @@ class Pipeline:
         return camera_image if self._float_images else to_uint8(camera_image, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
-        state = None
-        if self.config.discrete_state_input:
-            state = pad_last(sample.state, self.config.prompt_state_dim or 0)
-        sample.tokens, sample.token_mask = self.tokenizer.tokenize(
-            sample.prompt,
+        sample.prompt_state = pad_last(sample.state, self.config.prompt_state_dim or 0)
+        state = sample.prompt_state if self.config.discrete_state_input else None
+        sample.tokens, sample.token_mask = self._ids(sample.prompt, state, tagged=sample.guidance == 1)
+        if sample.guidance not in (0, 1):
+            ids, there = self._ids(sample.prompt, state, tagged=True)
+            sample.tagged = ids[there]
+
+    def _ids(self, prompt: str, state: np.ndarray | None, *, tagged: bool) -> tuple[np.ndarray, np.ndarray]:
+        return self.tokenizer.tokenize(
+            f"{prompt}\n{self.tag}" if tagged else prompt,
             state,
             max_tokens=self.config.model.max_prompt_tokens,
             as_is=self.config.prompt_as_is,
             labels=self.config.prompt_labels,
             write=self.write,
+            tagged=tagged,
         )
 
     def _pad_state(self, sample: Incoming) -> None:

@@ -137,14 +137,20 @@ class PromptTokenizer:
         as_is: bool = False,
         labels: bool = False,
         write: Write | None = None,
+        tagged: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
         `as_is`, `labels`, `write`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
-        `truncation_side` says; a warning is logged once for each.
+        `truncation_side` says; a warning is logged once for each. `tagged`: it is an ObservationError instead.
         """
         ids = self.encode(prompt, state, as_is=as_is, labels=labels, write=write)
         count = min(len(ids), max_tokens)
+        if count < len(ids) and tagged:
+            raise ObservationError(
+                f"the prompt and guidance's tag take {len(ids)} tokens, but the model reads {max_tokens}: the tag, or "
+                f"the state behind it, would be cut. Shorten the prompt: {prompt[:200]!r}"
+            )
         if count < len(ids):
             left = getattr(self.encoder, "truncation_side", "right") == "left"
             self._warn_truncated(prompt, len(ids), max_tokens, state is not None, left)

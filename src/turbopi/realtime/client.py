@@ -22,7 +22,7 @@ import numpy as np
 from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
 
 from turbopi.realtime.chunk import checked_answer
-from turbopi.realtime.messages import PREFIX, message
+from turbopi.realtime.messages import PREFIX, keeps_episode, message
 from turbopi.realtime.policy_socket import PolicySocket
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.realtime.shared_memory import Parts
@@ -119,7 +119,7 @@ class RealTimeClient:
             if check is not None:
                 check()
             reported = self._reported
-            if reported != self._episode and (self._keeps_chunk(sent) or "memory" in self.metadata):
+            if reported != self._episode and (self._keeps_chunk(sent) or keeps_episode(self.metadata)):
                 sent[f"{PREFIX}reset"], reported = True, self._episode
             packed = _packed(sent)
             assert self._socket is not None
@@ -163,6 +163,18 @@ class RealTimeClient:
         if not isinstance(memory, dict):
             raise ServerRefused(f'the policy server at {self.url} answered an observation without "memory"')
         return memory
+
+    def generate(self, obs: Mapping[str, Any], *, prompt: str | None = None, max_tokens: int | None = None) -> str:
+        """What the server's policy says to an observation, as `UnifiedPolicy.generate`.
+
+        Raises as `infer`, and ConfigError for a policy that writes no text.
+        """
+        options = {"generate": True if prompt is None else prompt, "max_tokens": max_tokens}
+        sent = {PREFIX + key: value for key, value in options.items() if value is not None}
+        text = self._answer({**obs, **sent}, self._check_writes).get("text")
+        if not isinstance(text, str):
+            raise ServerRefused(f'the policy server at {self.url} answered without a "text"')
+        return text
 
     def reset(self) -> None:
         """A new episode, as openpi's `BasePolicy.reset`: the next chunk joins none of the last one's, and a policy with
@@ -214,6 +226,10 @@ class RealTimeClient:
     def _check_remembers(self) -> None:
         if "memory" not in self.metadata:
             raise ConfigError(f"the policy server at {self.url} has no policy with memory: there is nothing to record")
+
+    def _check_writes(self) -> None:
+        if "text" not in self.metadata:
+            raise ConfigError(f'the policy server at {self.url} writes no text (its metadata has no "text")')
 
     def _keeps_chunk(self, sent: Mapping[str, Any]) -> bool:
         """Whether the server keeps the chunk that this request joins, in a session."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 
-from turbopi.config import Schedule
+from turbopi.config import LIMITS, Schedule
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.support.errors import ObservationError
 
@@ -27,11 +27,13 @@ MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
 MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
 MAX_SEED = 2**64 - 1
+MAX_TEXT = 2000  # characters of a text that a message gives
+MAX_TOKENS = LIMITS["max_decoding_steps"]
 # The last two are for people: the page and the log, and traces.
 SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch", "robot", "traceparent")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
-    *("session", "step", "reset", "seed", "observe"),
+    *("session", "step", "reset", "seed", "observe", "guidance", "subtask", "generate", "max_tokens"),
     *SCHEDULING_KEYS,
 )
 
@@ -50,6 +52,10 @@ class CallOptions:
     reset              a new episode: the session's running chunk is forgotten
     seed               draws the noise of this call, as `UnifiedPolicy.infer`'s: the same request, the same answer
     observe            a policy with memory records the observation, and computes nothing
+    prompt_guidance    the key "guidance": the scale of this call, as `UnifiedPolicy.infer`'s
+    subtask            what the actions are made of, of a policy that acts on subtasks
+    generate           the answer is the text that the policy writes, not actions: to this prompt, or True: to the
+                       observation's; of at most `max_tokens`
     """
 
     previous: RunningChunk | None = None
@@ -63,6 +69,15 @@ class CallOptions:
     reset: bool = False
     seed: int | None = None
     observe: bool = False
+    prompt_guidance: float | None = None
+    subtask: str | None = None
+    generate: str | bool = False
+    max_tokens: int | None = None
+
+
+def keeps_episode(metadata: Mapping[str, Any]) -> bool:
+    """Whether a policy of this metadata goes on from a robot's earlier observations, or from a subtask."""
+    return "memory" in metadata or "subtasks" in metadata
 
 
 PLAIN = CallOptions()
@@ -145,8 +160,37 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptio
         reset=_flag(given, "reset"),
         seed=_whole(given, "seed", 0, MAX_SEED),
         observe=_flag(given, "observe"),
+        prompt_guidance=_scale(given),
+        subtask=None if given.get("subtask") is None else _text(given, "subtask", "a text"),
+        generate=_generate(given),
+        max_tokens=_whole(given, "max_tokens", 1, MAX_TOKENS),
     )
+    if options.max_tokens is not None and not options.generate:
+        raise ObservationError(f"{PREFIX}max_tokens came without {PREFIX}generate, whose text it limits")
     return observation, options
+
+
+def _scale(given: Mapping[str, Any]) -> float | None:
+    if "guidance" not in given:
+        return None
+    scale = as_number(given["guidance"])
+    if scale is None:
+        raise ObservationError(f"{PREFIX}guidance is {given['guidance']!r:.100}; it should be a number")
+    return float(scale)
+
+
+def _generate(given: Mapping[str, Any]) -> str | bool:
+    value = given.get("generate", False)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    return _text(given, "generate", "true, or the prompt as a text")
+
+
+def _text(given: Mapping[str, Any], key: str, what: str) -> str:
+    value = given[key]
+    if not (isinstance(value, str) and value.strip() and len(value) <= MAX_TEXT):
+        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be {what} of 1 to {MAX_TEXT} characters")
+    return value
 
 
 def _left_over(given: Mapping[str, Any]) -> np.ndarray | None:
@@ -217,7 +261,8 @@ def _whole(given: Mapping[str, Any], key: str, least: int, most: int = MAX_STEP)
         return None
     value = as_number(given[key])
     if not isinstance(value, int) or not least <= value <= most:
-        raise ObservationError(f"{PREFIX}{key} is {given[key]!r:.100}; it should be a whole number from {least}")
+        numbers = f"{least}" if most in (MAX_STEP, MAX_SEED) else f"{least} to {most}"
+        raise ObservationError(f"{PREFIX}{key} is {given[key]!r:.100}; it should be a whole number from {numbers}")
     return value
 
 

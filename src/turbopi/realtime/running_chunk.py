@@ -11,8 +11,14 @@ from turbopi.support.errors import ObservationError
 if TYPE_CHECKING:  # a robot's computer joins chunks without PyTorch
     from turbopi.models.pi0.conditioning import Conditioning, Form
 
-JoinMode = Literal["rtc", "rtc_identity", "rtc_trained"]
-FORMS: "dict[JoinMode, Form]" = {"rtc": "jacobian", "rtc_identity": "tokens", "rtc_trained": "tokens"}
+JoinMode = Literal["rtc", "rtc_identity", "rtc_trained", "warm_start"]
+FORMS: "dict[JoinMode, Form]" = {
+    "rtc": "jacobian",
+    "rtc_identity": "tokens",
+    "rtc_trained": "tokens",
+    "warm_start": "solver",
+}
+WARM_START = 0.6  # t at which a warm start begins: so much noise, and the rest is the running chunk
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,8 @@ class RunningChunk:
                        is allowed, too: LeRobot's e of H or more
     mode               "rtc": guided, with the true Jacobian (arXiv 2506.07339). "rtc_identity": guided as LeRobot 0.6
                        computes it. "rtc_trained": the first d actions are held (arXiv 2512.05964), for checkpoints
-                       that were trained so
+                       that were trained so. "warm_start": denoising begins with the left-over, 60 % of it replaced by
+                       noise, and its last action in place of what is missing; nothing is held or pulled
     anchor             for relative actions: the "anchor" that came with the left-over, so that it can be moved to the
                        new state
     schedule, max_guidance_weight
@@ -134,6 +141,12 @@ class RunningChunk:
         return Conditioning(
             guidance=Guidance(target, weights, strength, "jacobian" if self.mode == "rtc" else "identity")
         )
+
+    def begun(self, left_over: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """x float32[H, action_dim] at t = WARM_START, of a warm start. `left_over` as `conditioning`'s."""
+        missing = len(noise) - len(left_over)
+        chunk = np.concatenate((left_over, left_over[-1:].repeat(missing, axis=0)))
+        return (WARM_START * noise + (1 - WARM_START) * chunk).astype(np.float32)
 
     def _checked_left_over(self, horizon: int, action_dim: int) -> np.ndarray:
         try:

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
-Execution = Literal["sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained"]
+Execution = Literal["sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained", "warm_start"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ WAYS: dict[str, Way] = {
     "rtc": Way("rtc", mode="rtc"),
     "rtc_identity": Way("rtc_identity", mode="rtc_identity"),
     "rtc_trained": Way("rtc_trained", mode="rtc_trained"),
+    "warm_start": Way("warm_start", mode="warm_start"),
 }
 assert tuple(WAYS) == get_args(Execution)
 

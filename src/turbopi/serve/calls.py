@@ -12,11 +12,13 @@ from functools import partial
 from typing import Any, Protocol
 
 from turbopi.realtime.chunk import checked_answer
+from turbopi.realtime.messages import keeps_episode
 from turbopi.realtime.queue import of_batch
 from turbopi.realtime.running_chunk import RunningChunk
-from turbopi.serve.memory import OBSERVE
+from turbopi.serve.memory import ALONE, OBSERVE
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
+from turbopi.serve.real_time import GENERATE
 from turbopi.serve.requests import Result
 from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.serve.scheduling.schedule import Request, Schedule
@@ -42,7 +44,8 @@ class Policy(Protocol):
     one for each observation.
 
     With "memory" in its metadata it has `new_history()` and `observe(obs, history=…)`, its `infer` takes `history`, and
-    requests run one by one.
+    requests run one by one. With "subtasks" it has `new_history()`, and its `infer` takes `history` and `subtask`; with
+    "text" it has `generate(obs, prompt=…, max_tokens=…)`.
 
     With a true `reads_in_place` it is done with an observation's images when it returns: the client may write the next
     ones over them.
@@ -89,7 +92,7 @@ class PolicyCalls:
         self._run_numbers = itertools.count()
         lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
         batch_modes = getattr(policy, "batch_modes", ())
-        remembers = "memory" in policy.metadata
+        remembers = keeps_episode(policy.metadata)
         of_policy: Any = {"batch_modes": batch_modes, "lacking": lacking, "remembers": remembers}
         largest = largest_batch(options, pipelined=self._pipelined, **of_policy)
         self.times = BatchTimes(largest)
@@ -205,7 +208,7 @@ class PolicyCalls:
         """
         request.call = _Call([observation], arguments, request.answer)
         if arguments:
-            request.joins = bool(arguments.keys() - {"seed", "history", OBSERVE})
+            request.joins = bool(arguments.keys() - {"seed", "guidance", "history", "subtask", *ALONE})
             request.alone = request.alone or not self._may_share(arguments)
         results = self.worker.submit(request)
         if self._pipelined and not arguments:
@@ -298,12 +301,18 @@ class PolicyCalls:
         if OBSERVE in arguments:
             observe = partial(self._observe, observation, arguments["history"])
             return self._result(time.perf_counter(), observe, arguments)
+        if GENERATE in arguments:
+            generate = partial(self._generate, observation, arguments[GENERATE])
+            return self._result(time.perf_counter(), generate, arguments)
         infer = partial(self._policy.infer, observation, **arguments, **self._readings)
         return self._result(time.perf_counter(), infer, arguments)
 
     def _observe(self, observation: dict[str, Any], history: Any) -> dict[str, Any]:
         self._policy.observe(observation, history=history)  # type: ignore[attr-defined]
         return {}
+
+    def _generate(self, observation: dict[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+        return {"text": self._policy.generate(observation, **options)}  # type: ignore[attr-defined]
 
     def _infer_batch(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
@@ -431,7 +440,7 @@ def largest_batch(
 
 def _checked(result: Result, answer: Any, arguments: Mapping[str, Any]) -> Result:
     """The result with the answer of an `infer` with these arguments, or with the error if no client may get it."""
-    if OBSERVE in arguments:
+    if arguments.keys() & ALONE:
         return replace(result, answer=answer)
     try:
         checked = checked_answer(answer, model_actions=bool(arguments.get("model_actions")))

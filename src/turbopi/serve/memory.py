@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from turbopi.realtime.messages import PREFIX, Note
-from turbopi.serve.real_time import IDLE_SECONDS, Plan
+from turbopi.serve.real_time import GENERATE, IDLE_SECONDS, Plan
 from turbopi.support.errors import ObservationError
 
 MOST_BYTES = 8 * 2**30  # of all histories, at least one
+MOST_SUBTASKS = 4096  # robots whose subtasks are kept
 OBSERVE = "observe"  # an argument of a call that records its observation alone
+ALONE = {OBSERVE, GENERATE}  # calls without actions
 
 
 @dataclass
@@ -46,14 +48,18 @@ class Histories:
     """For the event loop's thread alone; the policy records on its own thread, one observation of a robot at a time.
 
     make     a new, empty history: `UnifiedPolicy.new_history`
-    entries  bytes of a history with all of its entries
+    entries  bytes of a history with all of its entries; None: it holds a subtask, and nothing is missed
     """
 
     def __init__(
-        self, make: Callable[[], Any], entries: int, clock: Callable[[], float] = time.monotonic, most: int = MOST_BYTES
+        self,
+        make: Callable[[], Any],
+        entries: int | None,
+        clock: Callable[[], float] = time.monotonic,
+        most: int = MOST_BYTES,
     ) -> None:
-        self._make, self._clock = make, clock
-        self.most = max(1, most // max(1, entries))  # robots
+        self._make, self._clock, self._counts = make, clock, entries is not None
+        self.most = max(1, most // max(1, entries)) if entries is not None else MOST_SUBTASKS  # robots
         self._robots: dict[Hashable, _Robot] = {}  # by session's name, or ("connection", connection)
 
     def begin(self, plan: Plan, connection: Hashable) -> None:
@@ -107,6 +113,8 @@ class Histories:
         """The answer with what was recorded, and a note if observations were missed since the last answer."""
         one = plan.remembered
         assert one is not None
+        if not self._counts:
+            return dict(answer), None
         robot, more = one.robot, one.missed - one.robot.reported
         robot.reported = one.missed
         seen = robot.history.observations

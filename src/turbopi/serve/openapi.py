@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.realtime.messages import NOTE_KINDS, NOTES, PREFIX
+from turbopi.config import MOST_GUIDANCE
+from turbopi.realtime.messages import MAX_TOKENS, NOTE_KINDS, NOTES, PREFIX
 from turbopi.serve.http_api import ACTIONS, JSON, KINDS, MSGPACK, REFUSED
 from turbopi.serve.json_messages import to_json
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
@@ -30,8 +31,12 @@ OPTIONS: dict[str, dict[str, Any]] = {  # a request's keys behind "turbopi/", wh
     "session": _TEXT,
     "step": _COUNT,
     "reset": _YES,
+    "guidance": {"type": "number", "minimum": 0, "maximum": MOST_GUIDANCE},
     "seed": _COUNT,
     "observe": _YES,
+    "subtask": _TEXT,
+    "generate": {"type": ["boolean", "string"]},
+    "max_tokens": {"type": "integer", "minimum": 1, "maximum": MAX_TOKENS},
     "deadline_ms": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_DEADLINE_MS},
     "control_hz": {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_CONTROL_HZ},
     "left": {"type": "integer", "minimum": 1},
@@ -164,6 +169,8 @@ def _answer(metadata: Mapping[str, Any]) -> dict[str, Any]:
             "actions": {**actions, "description": "[action horizon, action dimension]; [B, …] of a batch"},
             "server_timing": timing,
             "policy_timing": timing,
+            "subtask": _TEXT,
+            "text": _TEXT,
             NOTES: {"type": "array", "items": note},
         },
     }

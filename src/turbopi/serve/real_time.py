@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 
 from turbopi.realtime import DelayEstimate
-from turbopi.realtime.messages import KEYS, PLAIN, PREFIX, SCHEDULING_KEYS, CallOptions, is_plain, read_message
+from turbopi.realtime.messages import (
+    KEYS,
+    PLAIN,
+    PREFIX,
+    SCHEDULING_KEYS,
+    CallOptions,
+    is_plain,
+    keeps_episode,
+    read_message,
+)
 from turbopi.realtime.queue import default_execution_horizon
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
@@ -25,6 +34,7 @@ from turbopi.support.errors import ConfigError, ObservationError
 
 NO_JOINING = "none"  # a mode: the session is there for the order of its requests alone
 MAX_SESSIONS = 256  # named ones with a chunk; a connection's own ends with it
+GENERATE = "generate"  # an argument of a call that writes a text alone: those of the policy's `generate`
 IDLE_SECONDS = 300.0  # a named session that got no chunk for so long is dropped
 
 
@@ -87,7 +97,8 @@ class RealTime:
         offered = metadata.get("real_time")
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
-        self._remembers = "memory" in metadata
+        self._remembers, self._writes = keeps_episode(metadata), "text" in metadata
+        self._acts_on_subtasks, self._guided = "subtasks" in metadata, "guidance" in metadata
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         # Those with a chunk, the one that got its chunk last at the end, and those with only a request.
         self._named: OrderedDict[str, _Session] = OrderedDict()
@@ -142,8 +153,16 @@ class RealTime:
         observation, requested = read_message(received)
         if requested.observe and not self._remembers:
             raise ObservationError(f"{PREFIX}observe is for a policy with memory, and this server's has none")
-        seeded = _seed(requested)
-        if self._joins_nothing(requested, unconditioned) and (self._modes or not seeded):
+        if requested.generate:
+            return Plan(observation, {GENERATE: self._text(requested)}, requested, name=requested.session)
+        if requested.subtask is not None and not self._acts_on_subtasks:
+            raise ObservationError(f"{PREFIX}subtask is for a policy that acts on subtasks, and this server's doesn't")
+        seeded = _of_call(requested)
+        if "guidance" in seeded and not self._guided:
+            raise ObservationError(
+                f"{PREFIX}guidance is for a policy with a tag, and this server's has none: start it with --guidance-tag"
+            )
+        if self._joins_nothing(requested, unconditioned) and (self._modes or requested.seed is None):
             return Plan(observation, seeded, requested, name=requested.session)
         if not self._modes:
             raise ObservationError(
@@ -175,9 +194,25 @@ class RealTime:
             )
         return self._plan_in_session(observation, requested, mode, connection, now)
 
+    def _text(self, requested: CallOptions) -> dict[str, Any]:
+        """The arguments of the policy's `generate`. Raises ObservationError."""
+        alone = CallOptions(session=requested.session, generate=requested.generate, max_tokens=requested.max_tokens)
+        if requested != alone:
+            raise ObservationError(
+                f"{PREFIX}generate asks for a text and no actions: it goes with {PREFIX}max_tokens and "
+                f"{PREFIX}session alone"
+            )
+        if not self._writes:
+            raise ObservationError(
+                f"{PREFIX}generate is for a policy that writes text (`text` in its metadata), and this server's "
+                "doesn't: docs/text.md says which do"
+            )
+        prompt = requested.generate if isinstance(requested.generate, str) else None
+        return {"prompt": prompt, "max_tokens": requested.max_tokens}
+
     def _joins_nothing(self, requested: CallOptions, unconditioned: bool) -> bool:
         """Whether a request needs no chunk. `unconditioned`: its mode is NO_JOINING. Raises ObservationError."""
-        of_chunk = replace(requested, seed=None, observe=False)
+        of_chunk = replace(requested, seed=None, observe=False, prompt_guidance=None, subtask=None)
         if self._remembers:  # these are of its history, too
             of_chunk = replace(of_chunk, reset=False, step=None)
         plain = of_chunk == CallOptions(session=requested.session)
@@ -208,7 +243,7 @@ class RealTime:
             about |= more
         elif requested.step is None:
             self._need_control_hz()
-        arguments = {"previous": previous, "model_actions": True, **_seed(requested)}
+        arguments = {"previous": previous, "model_actions": True, **_of_call(requested)}
         plan = Plan(observation, arguments, requested, session, requested.session, now, connection, about)
         session.chunk = chunk
         session.pending.append(plan)
@@ -406,9 +441,10 @@ def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon:
         )
 
 
-def _seed(requested: CallOptions) -> dict[str, Any]:
-    """The argument of `infer`, if the client chose one."""
-    return {} if requested.seed is None else {"seed": requested.seed}
+def _of_call(requested: CallOptions) -> dict[str, Any]:
+    """Arguments of `infer` that the client chose, and that have nothing to do with chunks."""
+    chosen = {"seed": requested.seed, "guidance": requested.prompt_guidance, "subtask": requested.subtask}
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _named(received: Mapping[str, Any]) -> str:

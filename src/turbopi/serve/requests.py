@@ -38,7 +38,7 @@ from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.memory import Histories
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS, ServerOptions
-from turbopi.serve.real_time import MAX_SESSIONS, Plan, RealTime
+from turbopi.serve.real_time import GENERATE, MAX_SESSIONS, Plan, RealTime
 from turbopi.serve.scheduling.schedule import PRIORITIES, Priority, Request
 from turbopi.support.errors import ObservationError
 
@@ -292,15 +292,16 @@ class RequestHandler:
         if scheduling.batch is None:
             plan = self._real_time.plan(received, connection)
             connection.robot = connection.robot or plan.name or connection.posted
-            if connection.posted and plan.name is None and (plan.session or self._histories):
+            histories = None if GENERATE in plan.arguments else self._histories
+            if connection.posted and plan.name is None and (plan.session or histories):
                 self._real_time.release(plan)
                 raise ObservationError(
                     f"a POST needs {PREFIX}session here: this server goes on from a robot's earlier requests, and each "
                     "POST is a connection of its own"
                 )
-            if self._histories is not None:
+            if histories is not None:
                 try:
-                    self._histories.begin(plan, connection)
+                    histories.begin(plan, connection)
                 except ObservationError:
                     self._real_time.release(plan)
                     raise
@@ -395,7 +396,7 @@ class RequestHandler:
             new += watch.to_log(notes)
             for note in notes:
                 self._metrics.note(note.kind)
-        if self._histories is not None:
+        if request.plan.remembered is not None:
             new += self._remember(request, results[0], watch)
         return new
 

@@ -31,6 +31,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
+from turbopi.realtime.messages import keeps_episode
 from turbopi.realtime.wire import pack, unpack
 from turbopi.recordings import Recorder
 from turbopi.recordings.limit import RecordLimit
@@ -117,12 +118,13 @@ class PolicyServer:
         )
         self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._calls.waits)
         self._histories = None
-        if "memory" in policy.metadata:
+        if keeps_episode(policy.metadata):
             if calls is not None:
                 raise ConfigError(
                     "this policy has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
                 )
-            self._histories = Histories(policy.new_history, policy.metadata["memory"]["bytes"])  # type: ignore[attr-defined]
+            size = policy.metadata.get("memory", {}).get("bytes")
+            self._histories = Histories(policy.new_history, size)  # type: ignore[attr-defined]
         self._lost: Future[None] = Future()  # done when `lost` is there: from the worker's thread
         self._requests = RequestHandler(
             self._calls,

@@ -91,6 +91,12 @@ def images_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.n
     return found
 
 
+def task_of(observation: Mapping[str, Any], answer: Mapping[str, Any]) -> str:
+    """`prompt_of`, and the subtask that the answer's actions are made of, if that is another text."""
+    prompt, subtask = prompt_of(observation), answer.get("subtask")
+    return f"{prompt} → {subtask}" if isinstance(subtask, str) and subtask != prompt else prompt
+
+
 def prompt_of(observation: Mapping[str, Any]) -> str:
     """What an observation of any robot says that the task is: its `prompt`, `task` or only text; "" without one."""
     texts = {key: value for key, value in observation.items() if isinstance(value, str)}

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from turbopi.recordings import load_call, recorded_files
-from turbopi.support.action_groups import images_of, prompt_of
+from turbopi.support.action_groups import images_of, task_of
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading import is_finite, read_json
 from turbopi.view.calls import EncodedImage, ViewedCall, ViewedTrouble
@@ -52,7 +52,7 @@ def recorded(recording: Path) -> Iterator[ViewedCall | ViewedTrouble]:
             robot="",
             number=number,
             time=call.time,
-            prompt=prompt_of(call.observation),
+            prompt=task_of(call.observation, call.result),
             actions=_actions(call.result),
             camera_images={
                 name: as_png(camera_image)

@@ -255,7 +255,8 @@ class TurboPiPolicy(PreTrainedPolicy):
         each = (host.images, host.image_mask, host.tokens, host.token_mask, host.state)
         rows = [ModelInputs(*arrays) for arrays in zip(*(part.numpy() for part in each), strict=True)]
         if not self._histories:
-            self._histories = [self._local.new_history() for _ in rows]
+            made = [self._local.new_history() for _ in rows]
+            self._histories = [one for one in made if isinstance(one, ObservationHistory)]
         if len(rows) != len(self._histories):
             raise ObservationError(
                 f"the batch has {len(rows)} rows, and those before it {len(self._histories)}: a policy with memory "

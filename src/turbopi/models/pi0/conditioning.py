@@ -1,7 +1,8 @@
 """What a denoising loop may be asked for beyond "noise to actions": times by token, a solver, held actions, guidance.
 
-Real-time execution needs nothing else of the model (docs/real_time.md). N steps, H actions, A action_dim; t = 1 is
-noise and t = 0 the action. One call of the loop, for every action i and step s:
+Real-time execution needs nothing else of the model (docs/real_time.md), and classifier-free guidance a second prompt:
+then v below is a mixture of two velocities, see `PromptGuidance`. N steps, H actions, A action_dim; t = 1 is noise and
+t = 0 the action. One call of the loop, for every action i and step s:
 
     x̂ = x − t[s, i] · v                                       the chunk that v points to
     v ← v − strength[s, i] · (Jᵀ[(target − x̂) ⊙ weights])[i]  with guidance: J = ∂x̂/∂x, or the identity in its place
@@ -14,20 +15,23 @@ With a solver other than Euler's the last line is another one, and the same for 
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from torch import Tensor
 
+from turbopi.config import MOST_GUIDANCE
 from turbopi.config import Schedule as Schedule
 from turbopi.models.pi0.denoise import time_grid
 from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import ObservationError
+from turbopi.support.reading import is_finite, shown
 
 GuidanceMode = Literal["jacobian", "identity"]
 # What a backend must be able to do: a solver or a time grid of its own; times, steps and values by token, identity
-# guidance among them; the true Jacobian.
-Form = Literal["plain", "solver", "tokens", "jacobian"]
+# guidance among them; the true Jacobian; a second prompt, with all of these but the Jacobian, and with it.
+Form = Literal["plain", "solver", "tokens", "jacobian", "two_prompts", "two_prompts_jacobian"]
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,44 @@ class Guidance:
 
 
 @dataclass(frozen=True)
+class PromptGuidance:
+    """Classifier-free guidance (Ho and Salimans 2022) by a prompt with a tag, as RECAP's policies are trained for.
+
+    Each v is (1 − scale) v_u + scale v_c: of the observation's own prompt, and of this one, both at the same x and t.
+
+    tokens  int64[P]  the valid ids of the prompt with its tag
+    scale   0: the observation's prompt alone; 1: this one alone; above 1: away from the first
+    """
+
+    tokens: np.ndarray
+    scale: float
+
+    @property
+    def factors(self) -> tuple[float, float]:
+        """Of v_u and of v_c: float32 numbers."""
+        return float(np.float32(1 - self.scale)), float(np.float32(self.scale))
+
+    def mixed(self, v_u: Tensor, v_c: Tensor) -> Tensor:
+        """v, in float32."""
+        of_u, of_c = self.factors
+        return of_u * v_u + of_c * v_c
+
+    def check(self) -> None:
+        """Raises ObservationError for what can't be."""
+        ids = self.tokens
+        if not isinstance(ids, np.ndarray) or ids.dtype != np.int64 or ids.ndim != 1 or not len(ids):
+            raise ObservationError(f"the second prompt is {_described(ids)}; it should be int64 ids of shape [P]")
+        checked_scale(self.scale)
+
+
+def checked_scale(scale: float) -> float:
+    """A `PromptGuidance`'s. Raises ObservationError."""
+    if not is_finite(scale) or not 0 <= scale <= MOST_GUIDANCE:
+        raise ObservationError(f"the guidance is {shown(scale)}; it should be a number from 0 to {MOST_GUIDANCE:g}")
+    return float(scale)
+
+
+@dataclass(frozen=True)
 class Conditioning:
     """All of it, for one observation. What is None is as openpi has it, to the last bit.
 
@@ -115,10 +157,18 @@ class Conditioning:
     values: np.ndarray | None = None  # float32[H, A]; rows that aren't held are ignored
     guidance: Guidance | None = None
     integration: Integration | None = None  # in place of `tokens`: a solver, and one grid of times for all actions
+    prompt: PromptGuidance | None = None
+
+    @property
+    def one_prompt(self) -> "Conditioning":
+        """All of it but the second prompt."""
+        return self if self.prompt is None else replace(self, prompt=None)
 
     @property
     def form(self) -> Form:
         """What a backend must be able to do. "plain": nothing beside openpi's loop."""
+        if self.prompt is not None:
+            return "two_prompts_jacobian" if self.one_prompt.form == "jacobian" else "two_prompts"
         if self.guidance is not None and self.guidance.mode == "jacobian":
             return "jacobian"
         holds = self.held is not None and bool(np.any(self.held))
@@ -158,6 +208,8 @@ class Conditioning:
     def check(self, num_steps: int, horizon: int, action_dim: int) -> None:
         """Raises ObservationError if any of it doesn't fit a loop of so many steps and actions."""
         grid, chunk = (num_steps, horizon), (horizon, action_dim)
+        if self.prompt is not None:
+            self.prompt.check()
         if self.integration is not None:
             self._check_integration(self.integration, num_steps)
         if self.tokens is not None:
@@ -191,7 +243,7 @@ class Conditioning:
                 f"a loop of {num_steps} steps was asked for, but {integration} takes {integration.evaluations} "
                 "evaluations: say so, or take another time grid"
             )
-        what = "guidance" if self.guidance is not None else "held actions" if self.form == "tokens" else None
+        what = "guidance" if self.guidance is not None else "held actions" if self.one_prompt.form == "tokens" else None
         if what is not None and not integration.is_euler:
             raise ObservationError(
                 f"{what} and solver {integration.solver!r} were both asked for: {what} take Euler's steps, so take "
@@ -200,6 +252,12 @@ class Conditioning:
 
 
 Conditionings = Conditioning | Sequence[Conditioning | None] | None  # for all rows of a batch, or one each
+
+
+def has_two_prompts(conditionings: Conditionings) -> bool:
+    """Whether guidance by a second prompt is among them."""
+    each = conditionings if isinstance(conditionings, Sequence) else [conditionings]
+    return any(one is not None and one.prompt is not None for one in each)
 
 
 def of_rows(conditionings: Conditionings, rows: int) -> Sequence[Conditioning | None]:

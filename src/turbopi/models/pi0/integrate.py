@@ -8,7 +8,10 @@ import torch
 from torch import Tensor
 
 from turbopi.config import TimeRounding
-from turbopi.models.pi0.conditioning import Conditioning, of_rows
+from turbopi.models.pi0.conditioning import Conditioning, PromptGuidance, of_rows
+from turbopi.support.errors import ObservationError
+
+Velocity = Callable[[Tensor, Tensor, bool], tuple[Tensor, Tensor]]  # see `integrate`
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,16 @@ def guided_velocity(
     return out.detach(), v_t - pull.strength * (error - through)
 
 
+def mixed_velocity(velocity: Velocity, second: Velocity, guidance: PromptGuidance) -> Velocity:
+    """Of two prompts, mixed as `PromptGuidance` says."""
+
+    def mixed(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+        out, v_u = velocity(x, time, first)
+        return out, guidance.mixed(v_u, second(x, time, False)[1])
+
+    return mixed
+
+
 @dataclass(frozen=True)
 class Integrated:
     """Actions float32[B, H, A], and how they came about.
@@ -63,7 +76,7 @@ class Integrated:
 
 
 def integrate(
-    velocity: Callable[[Tensor, Tensor, bool], tuple[Tensor, Tensor]],
+    velocity: Velocity,
     embed_times: Callable[[np.ndarray], Tensor],
     noise: Tensor,
     num_steps: int,
@@ -71,6 +84,7 @@ def integrate(
     *,
     grid: TimeRounding,
     keep: bool = False,
+    second: Velocity | None = None,
 ) -> Integrated:
     """The loop from noise float32[B, H, A] to actions: steps, times, held actions, guidance and solvers.
 
@@ -78,11 +92,16 @@ def integrate(
     embed_times  float32[U] -> [U, D]
     grid         how uniform times are rounded, see `time_grid`
     keep         all evaluations, for a trace
+    second       as `velocity`, of the prompt with a tag, for guidance by it; the expert's output is the first prompt's
 
     Raises ObservationError for a conditioning that doesn't fit.
     """
     horizon, wanted = noise.shape[1], requested or Conditioning()
     wanted.check(num_steps, horizon, noise.shape[2])
+    if wanted.prompt is not None:
+        if second is None:
+            raise ObservationError("guidance by a second prompt was asked for, but nothing was computed of that prompt")
+        velocity = mixed_velocity(velocity, second, wanted.prompt)
     tokens, guidance = wanted.token_times(num_steps, horizon, grid), wanted.guidance
     distinct = tokens.distinct()
     rows = tokens.rows(distinct)

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.models.observation import Observation, past_of
+from turbopi.models.observation import Observation, SeenObservation, past_of
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class PrefixLayout:
     positions: Tensor  # int64[B, S_padded]  RoPE positions: count of valid slots so far, minus 1
     columns: Tensor | None  # int64[S]  the slots that are computed
     mask: Tensor | None  # bool[B, S]  which of the computed slots are valid; None: all
+    causal: Tensor | None = None  # bool[B, S]  which of them no slot before them sees; None: all see each other
 
     @classmethod
     def of(cls, observation: Observation, tokens_per_image: int, *, compact: bool) -> "PrefixLayout":
@@ -30,11 +32,25 @@ class PrefixLayout:
         images = observation.image_mask.repeat_interleave(tokens_per_image, dim=1)
         pad_mask = torch.cat((images, *states, observation.token_mask), dim=1)
         positions = pad_mask.cumsum(1) - 1
+        causal = None
+        if isinstance(observation, SeenObservation) and observation.causal is not None:
+            causal = F.pad(observation.causal, (pad_mask.shape[1] - observation.causal.shape[1], 0))
         if not compact:
-            return cls(pad_mask, positions, None, pad_mask)
+            return cls(pad_mask, positions, None, pad_mask, causal)
         columns = pad_mask.any(0).nonzero().squeeze(1)
         mask = pad_mask[:, columns]
-        return cls(pad_mask, positions, columns, None if bool(mask.all()) else mask)
+        causal = None if causal is None else causal[:, columns]
+        return cls(pad_mask, positions, columns, None if bool(mask.all()) else mask, causal)
+
+    @property
+    def attended(self) -> Tensor | None:
+        """bool[B, 1, 1 or S, S]: the slots that a slot attends to; None: all."""
+        valid = None if self.mask is None else self.mask[:, None, None, :]
+        if self.causal is None:
+            return valid
+        block = self.causal.cumsum(1)  # a causal slot begins one; a slot sees its own and those before
+        seen = block[:, None, None, :] <= block[:, None, :, None]
+        return seen if valid is None else seen & valid
 
     @property
     def computed_positions(self) -> Tensor:
@@ -57,6 +73,7 @@ class EmbeddedPrefix:
     layout: PrefixLayout
     lengths: Tensor  # int64[B]  valid prefix tokens
     state: Tensor  # float32[B, action_dim]
+    tagged: "EmbeddedPrefix | None" = None  # the same images with the prompt of `PromptGuidance`
 
 
 @dataclass(frozen=True)
@@ -68,9 +85,11 @@ class KVCache:
     mask: Tensor | None  # bool[B, S]; None: every slot is valid
     lengths: Tensor  # int64[B]  valid prefix tokens; the suffix's positions go on from here
     state: Tensor  # float32[B, action_dim]  Pi0's suffix starts with it; Pi0.5 ignores it
+    tagged: "KVCache | None" = None  # of the prompt of `PromptGuidance`
 
     def row(self, row: int) -> "KVCache":
         """One observation's alone, masked as before."""
         one = slice(row, row + 1)
         mask = None if self.mask is None else self.mask[one]
-        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one])
+        tagged = None if self.tagged is None else self.tagged.row(row)
+        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one], tagged)

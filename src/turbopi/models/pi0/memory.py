@@ -119,7 +119,7 @@ def frame_mask(valid: Tensor) -> Tensor:
 class Stages:
     """The stages that backends/captured.py captures, of observations without a masked camera: nothing asks the host."""
 
-    def __init__(self, model: MemoryModel) -> None:
+    def __init__(self, model: Pi0Model) -> None:
         self._model = model
 
     def embed_images(self, observation: Observation) -> Tensor:
@@ -133,7 +133,7 @@ class Stages:
 
     def encode_prefix(self, embedded: EmbeddedPrefix) -> tuple[Tensor, Tensor, Tensor]:
         layout = embedded.layout
-        k, v = self._model.encode_prefix(embedded.embs, layout.positions, layout.pad_mask[:, None, None, :])
+        k, v = self._model.encode_prefix(embedded.embs, layout.positions, layout.attended)
         return k, v, layout.positions
 
     def cache_of(self, embedded: EmbeddedPrefix, k: Tensor, v: Tensor) -> KVCache:

@@ -42,7 +42,7 @@ def prefix_keys_values(
 ) -> tuple[Tensor, Tensor]:
     """Run embeddings [B, S, D] through all layers -> K, V [layer, B, G, S, K].
 
-    `mask` bool[B, 1, 1, S] says which keys are valid. Queries need none: what a padded one sees is never read.
+    `mask` bool[B, 1, 1 or S, S] says which keys are seen. Padded queries need none: what they see is never read.
     """
     keys, values = [], []
     x = embs

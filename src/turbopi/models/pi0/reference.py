@@ -12,6 +12,7 @@ Precisions: float32 (the oracle), and bfloat16 as openpi serves it, except that 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,12 +21,12 @@ from torch import Tensor, nn
 
 from turbopi.config import FloatPrecision as FloatPrecision
 from turbopi.config import ModelConfig
-from turbopi.models.observation import Observation
-from turbopi.models.pi0.conditioning import Conditioning, Conditionings
+from turbopi.models.observation import Observation, SeenObservation
+from turbopi.models.pi0.conditioning import Conditioning, Conditionings, has_two_prompts, of_rows
 from turbopi.models.pi0.denoise import run_expert, suffix_mask, suffix_rope, time_embedding
 from turbopi.models.pi0.exact import exact_float32
 from turbopi.models.pi0.gemma import Gemma
-from turbopi.models.pi0.integrate import integrate, integrate_rows
+from turbopi.models.pi0.integrate import Velocity, integrate, integrate_rows
 from turbopi.models.pi0.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
 from turbopi.models.pi0.layers import rope_tables
 from turbopi.models.pi0.prefix import camera_slots, embed_images, embed_prompt, prefix_keys_values
@@ -106,20 +107,28 @@ class Pi0Model(nn.Module):
         trace: Trace | None = None,
     ) -> Tensor:
         """Actions float32[B, H, action_dim], normalised, from noise of that shape: deterministic for given noise."""
-        cache = self.prefix(observation, compact=compact, trace=trace)
+        cache = self.prefix(observation, compact=compact, conditioning=conditioning, trace=trace)
         return self.denoise(cache, noise, num_steps, conditioning=conditioning, trace=trace)
 
     @torch.no_grad()
     @exact_float32()
-    def prefix(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> KVCache:
-        """Keys and values of an observation: `embed`, then `keys_values`.
+    def prefix(
+        self,
+        observation: Observation,
+        *,
+        compact: bool = True,
+        conditioning: Conditionings = None,
+        trace: Trace | None = None,
+    ) -> KVCache:
+        """Keys and values of an observation: `embed`, then `keys_values`. Of a conditioning the second prompt counts.
 
         compact=True computes only the slots that some batch row needs (for B = 1: no masked camera and no padding);
         compact=False computes all S slots under a mask. Both give the same actions.
 
         Raises ObservationError if a row has no valid camera and no valid prompt token.
         """
-        return self.keys_values(self.embed(observation, compact=compact, trace=trace), trace=trace)
+        embedded = self.embed(observation, compact=compact, conditioning=conditioning, trace=trace)
+        return self.keys_values(embedded, trace=trace)
 
     @torch.no_grad()
     @exact_float32()
@@ -148,20 +157,31 @@ class Pi0Model(nn.Module):
             return integrate_rows(one_row, conditioning, noise.shape[0], trace)
         config, horizon = self.config, noise.shape[1]
         suffix_len = horizon + (config.kind == "pi0")  # Pi0's state token comes first
-        rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
-        mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
         hidden: list[Tensor] = []
 
         def embed_times(times: np.ndarray) -> Tensor:
             embedded = time_embedding(times, config.expert.width).to(noise.device)  # [U, D]
             return self.time_condition(embedded) if config.kind == "pi05" else embedded
 
-        def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
-            record = hidden if trace is not None and first else None
-            return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
+        def velocity_of(cache: KVCache) -> Velocity:
+            rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
+            mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
+
+            def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+                record = hidden if trace is not None and first else None
+                return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
+
+            return velocity
 
         done = integrate(
-            velocity, embed_times, noise, num_steps, conditioning, grid=config.time_grid, keep=trace is not None
+            velocity_of(cache),
+            embed_times,
+            noise,
+            num_steps,
+            conditioning,
+            grid=config.time_grid,
+            keep=trace is not None,
+            second=None if cache.tagged is None else velocity_of(cache.tagged),
         )
         if trace is not None:
             batch, by_row = noise.shape[0], done.rows
@@ -184,41 +204,61 @@ class Pi0Model(nn.Module):
 
     @torch.no_grad()
     @exact_float32()
-    def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
-        """Images and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
-        per_image = self.config.vision.num_tokens
-        layout = PrefixLayout.of(observation, per_image, compact=compact)
-        lengths = layout.pad_mask.sum(1)
-        if not bool((lengths > 0).all()):
-            raise ObservationError("an observation without any valid camera or prompt token has nothing to attend to")
+    def embed(
+        self,
+        observation: Observation,
+        *,
+        compact: bool = True,
+        conditioning: Conditionings = None,
+        trace: Trace | None = None,
+    ) -> EmbeddedPrefix:
+        """Images and prompt to the embeddings that enter the language model (the vision tower is most of it).
+
+        Of a conditioning the second prompt counts, which comes behind the same images.
+        """
+        per_image, layout = self.config.vision.num_tokens, self._layout(observation, compact=compact)
         cameras = camera_slots(observation, compact=compact)
-        image_embs, hidden = self.embed_cameras(observation, cameras)
+        seen = observation.seen if isinstance(observation, SeenObservation) else None
+        image_embs, hidden = self.embed_cameras(observation, cameras) if seen is None else seen
         if cameras is not None:  # back to their slots, from which the layout selects
             count = observation.image_mask.shape[1]
             slots = (cameras[:, None] * per_image + torch.arange(per_image, device=cameras.device)).flatten()
             image_embs = _scatter(image_embs, 1, slots, count * per_image)
             hidden = _scatter(hidden, 0, cameras, count)
-        prompt = embed_prompt(self.vlm, observation.tokens)
-        embs = torch.cat((image_embs, *self.embed_states(observation), prompt), dim=1)
-        embs = embs if layout.columns is None else embs[:, layout.columns]
+        before_prompt = image_embs, *self.embed_states(observation)
+
+        def with_prompt(tokens: Tensor, layout: PrefixLayout) -> EmbeddedPrefix:
+            embs = torch.cat((*before_prompt, embed_prompt(self.vlm, tokens)), dim=1)
+            embs = embs if layout.columns is None else embs[:, layout.columns]
+            return EmbeddedPrefix(embs, layout, layout.pad_mask.sum(1), observation.state)
+
+        embedded = with_prompt(observation.tokens, layout)
         if trace is not None:
             trace["vision_last_hidden"] = hidden
-            trace["prefix_embs"] = layout.to_padded(embs, 1)
+            trace["prefix_embs"] = layout.to_padded(embedded.embs, 1)
             trace["prefix_pad_mask"] = layout.pad_mask
             trace["prefix_positions"] = layout.positions
-        return EmbeddedPrefix(embs, layout, lengths, observation.state)
+        if (tagged := with_second_prompt(observation, conditioning)) is None:
+            return embedded
+        return replace(embedded, tagged=with_prompt(tagged.tokens, self._layout(tagged, compact=compact)))
+
+    def _layout(self, observation: Observation, *, compact: bool) -> PrefixLayout:
+        layout = PrefixLayout.of(observation, self.config.vision.num_tokens, compact=compact)
+        if not bool(layout.pad_mask.any(1).all()):
+            raise ObservationError("an observation without any valid camera or prompt token has nothing to attend to")
+        return layout
 
     @torch.no_grad()
     @exact_float32()
     def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
         """Run the language model over embedded tokens and keep every layer's keys and values."""
         layout = embedded.layout
-        mask = None if layout.mask is None else layout.mask[:, None, None, :]
-        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, mask)
+        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, layout.attended)
         if trace is not None:
             trace["kv_k"] = layout.to_padded(k, 3).transpose(2, 3)
             trace["kv_v"] = layout.to_padded(v, 3).transpose(2, 3)
-        return KVCache(k, v, layout.mask, embedded.lengths, embedded.state)
+        tagged = None if embedded.tagged is None else self.keys_values(embedded.tagged)
+        return KVCache(k, v, layout.mask, embedded.lengths, embedded.state, tagged)
 
     def embed_cameras(self, observation: Observation, cameras: Tensor | None) -> tuple[Tensor, Tensor]:
         """`embed_images` of an observation's, of some cameras alone, by their indices."""
@@ -270,6 +310,19 @@ class Pi0Model(nn.Module):
         mixed = torch.cat((actions, time_emb.expand_as(actions)), dim=-1)
         actions = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
         return torch.cat((self.state_proj(state)[:, None], actions), dim=1).to(self.compute_dtype)
+
+
+def with_second_prompt(observation: Observation, conditioning: Conditionings) -> Observation | None:
+    """An observation with the prompts of `PromptGuidance`, of rows without it their own; None: no row has it."""
+    if not has_two_prompts(conditioning):
+        return None
+    guidance = [None if one is None else one.prompt for one in of_rows(conditioning, observation.batch_size)]
+    own = [ids[there].cpu() for ids, there in zip(observation.tokens, observation.token_mask, strict=True)]
+    rows = [ids if one is None else torch.from_numpy(one.tokens) for ids, one in zip(own, guidance, strict=True)]
+    padded = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+    there = torch.arange(padded.shape[1])[None] < torch.tensor([len(ids) for ids in rows])[:, None]
+    device = observation.tokens.device
+    return replace(observation, tokens=padded.to(device), token_mask=there.to(device))
 
 
 def _scatter(x: Tensor, dim: int, index: Tensor, size: int) -> Tensor:

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from turbopi.config import Pi0FastConfig
 from turbopi.models.family import AnswerReader, Pieces
+from turbopi.models.pi0.decoding import EOS
 from turbopi.models.pi0_fast.action_tokens import BEGINNING, END, FastTokenizer, codes_of, owners_actions
 from turbopi.support.errors import ActionError, TokenizerError
-
-EOS = 1  # of PaliGemma's SentencePiece model
 
 
 @dataclass(frozen=True)

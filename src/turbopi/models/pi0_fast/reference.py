@@ -5,13 +5,8 @@
     generate(observation, …)      both, until the answer is over
 
 It is Pi0's vision tower, projector and language model without the action expert; a token's logits are the final norm's
-output times the embedding table. openpi and LeRobot run it differently, see `FastRules`.
-
-Keys, values and all else that a step reads or writes are buffers of a fixed size, counters among them, so that a step
-can be captured once and replayed. It never waits for the device.
-
-Shapes: B batch, C cameras, P prompt places, S prefix places, N tokens of an answer at most, V vocabulary, D width, G
-key/value heads, K head_dim.
+output times the embedding table. openpi and LeRobot run it differently, see `FastRules`. The loop: pi0/decoding.py,
+whose shapes these are, with C cameras and P prompt places.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,13 +19,11 @@ from torch import Tensor, nn
 from turbopi.config import Owner, Pi0FastConfig
 from turbopi.models.family import AnswerReader
 from turbopi.models.observation import Observation
+from turbopi.models.pi0.decoding import BOS, Decoding, Writer
 from turbopi.models.pi0.exact import exact_float32
 from turbopi.models.pi0.gemma import Gemma
-from turbopi.models.pi0.layers import gated_residual, rope_tables
 from turbopi.models.pi0.prefix import embed_images, embed_prompt
 from turbopi.models.pi0.vision import VisionTower
-
-BOS = 2  # of PaliGemma's SentencePiece model
 
 # Names of what a trace records: prefix_embs [B, S, D], prefix_pad_mask bool[B, S], prefix_positions int[B, S],
 # kv_k, kv_v [L, B, C * 256 + P, G, K], decode_positions int[N]: of the last prefix token and of each decoded one,
@@ -57,48 +50,7 @@ RULES: dict[Owner, FastRules] = {
 }
 
 
-@dataclass(frozen=True)
-class Decoding:
-    """An answer as it grows, in place.
-
-    keys, values  [B, G, S + N, K] by layer
-    valid         bool[B, S + N]   what a token may attend to
-    ids           int64[B, N]      written so far: `count` int64[1] of them
-    chosen        int64[B]         the last one
-    place         int64[1]         of its keys and values; `position` int64[B]: for RoPE
-    logits        float32[B, V]    by which it was chosen
-    ends, ended   int64[E], bool[B]  whether one of `ends` was written
-    """
-
-    keys: tuple[Tensor, ...]
-    values: tuple[Tensor, ...]
-    valid: Tensor
-    ids: Tensor
-    count: Tensor
-    chosen: Tensor
-    place: Tensor
-    position: Tensor
-    logits: Tensor
-    ends: Tensor
-    ended: Tensor
-
-    def rows(self, reader: AnswerReader, most: int) -> list[list[int]] | None:
-        """The answers, each to its end or `most` ids; None while one isn't over. Waits for the device."""
-        written = self.ids[:, : min(int(self.count), most)].tolist()
-        rows = [_to_its_end(row, reader) for row in written]
-        if len(written[0]) < most and any(row is None for row in rows):
-            return None
-        return [ids if row is None else row for row, ids in zip(rows, written, strict=True)]
-
-
-def _to_its_end(ids: list[int], reader: AnswerReader) -> list[int] | None:
-    for at, one in enumerate(ids, 1):
-        if one in reader.ends and reader.over(ids[:at]):
-            return ids[:at]
-    return None
-
-
-class Pi0FastModel(nn.Module):
+class Pi0FastModel(Writer):
     """Build it on the meta device and load a checkpoint's tensors."""
 
     def __init__(self, config: Pi0FastConfig) -> None:
@@ -142,51 +94,18 @@ class Pi0FastModel(nn.Module):
         mark("vision")
         self.begin(observation, decoding, embedded=embedded, trace=trace)
         mark("prefix")
-        positions, logits = [decoding.position - 1 - self.rules.skipped], [decoding.logits.clone()]
-        written = 1
-        while True:
-            over = written == steps or (forced is None and bool(decoding.ended.any()))
-            if over and (rows := decoding.rows(reader, steps)) is not None:
-                break
-            if forced is not None:
-                decoding.chosen.fill_(forced[written - 1])
-            if trace is not None:
-                positions.append(decoding.position.clone())
-            self.step(decoding)
-            written += 1
-            if trace is not None:
-                logits.append(decoding.logits.clone())
+        rows, written = self.finish(decoding, reader, steps, keep=trace is not None, forced=forced)
         mark("denoise")
         if trace is not None:
-            trace |= {"logits": torch.stack(logits), "decode_positions": torch.stack(positions)}
+            trace |= written
+            trace["decode_positions"][0] -= self.rules.skipped
         return rows
 
     def allocate(self, observation: Observation, steps: int, ends: Sequence[int]) -> Decoding:
         """Buffers for observations of this shape, answers of at most `steps` tokens, and ids that end them."""
         b, c = observation.image_mask.shape
         prefix = c * self.config.vision.num_tokens + observation.tokens.shape[1] + self.rules.bos_after_prompt
-        of, device = self.config.vlm, self.device
-        shape, dtype = (b, of.num_kv_heads, prefix + steps, of.head_dim), self.projector.weight.dtype
-
-        def caches() -> tuple[Tensor, ...]:
-            return tuple(torch.zeros(shape, dtype=dtype, device=device) for _ in range(of.depth))
-
-        def whole(*size: int) -> Tensor:
-            return torch.zeros(size, dtype=torch.int64, device=device)
-
-        return Decoding(
-            caches(),
-            caches(),
-            valid=torch.zeros(b, prefix + steps, dtype=torch.bool, device=device),
-            ids=whole(b, steps),
-            count=whole(1),
-            chosen=whole(b),
-            place=whole(1),
-            position=whole(b),
-            logits=torch.zeros(b, self.config.vocab_size, device=device),
-            ends=torch.tensor(list(ends), dtype=torch.int64, device=device),
-            ended=torch.zeros(b, dtype=torch.bool, device=device),
-        )
+        return self.buffers_for(b, prefix, steps, ends)
 
     def embed_images(self, images: Tensor) -> Tensor:
         """(uint8 [0, 255] | float32 [-1, 1])[B, C, 224, 224, 3] -> [B, C * 256, D]"""
@@ -213,54 +132,13 @@ class Pi0FastModel(nn.Module):
             parts.append(embed_prompt(self.vlm, bos))
             masks.append(torch.ones_like(bos, dtype=torch.bool))
         x, valid = torch.cat(parts, dim=1), torch.cat(masks, dim=1)
-        positions, prefix, mask = valid.long().cumsum(1) - 1, valid.shape[1], valid[:, None, None, :]
         if trace is not None:
-            trace |= {"prefix_embs": x, "prefix_pad_mask": valid, "prefix_positions": positions}
-        rope = rope_tables(positions, self.config.vlm.head_dim, self.config.rope_base)
-        for layer, keys, values in zip(self.vlm.layers, decoding.keys, decoding.values, strict=True):
-            normed, gate = layer.input_layernorm(x)
-            k, v = layer.keys_values(normed, rope)
-            keys[:, :, :prefix].copy_(k)
-            values[:, :, :prefix].copy_(v)
-            x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, k, v, mask), gate))
+            trace |= {"prefix_embs": x, "prefix_pad_mask": valid, "prefix_positions": valid.long().cumsum(1) - 1}
+        self.read_prefix(decoding, x, valid, skipped=self.rules.skipped)
         if trace is not None:
-            rows = prefix - self.rules.bos_after_prompt
+            rows = valid.shape[1] - self.rules.bos_after_prompt
             for name, caches in (("kv_k", decoding.keys), ("kv_v", decoding.values)):
                 trace[name] = torch.stack([one[:, :, :rows].transpose(1, 2) for one in caches])
-        decoding.valid.zero_()
-        decoding.valid[:, :prefix].copy_(valid)
-        decoding.count.zero_()
-        decoding.ended.zero_()
-        decoding.place.fill_(prefix)
-        decoding.position.copy_(valid.sum(1) + self.rules.skipped)
-        last = torch.arange(prefix, device=x.device).where(valid, -1).amax(1)
-        self._choose(decoding, x.gather(1, last[:, None, None].expand(-1, 1, x.shape[2])))
-
-    def step(self, decoding: Decoding) -> None:
-        """Run the last id and choose the next one. At most N - 1 times after `begin`."""
-        x = embed_prompt(self.vlm, decoding.chosen[:, None])
-        decoding.valid.index_fill_(1, decoding.place, True)
-        mask = decoding.valid[:, None, None, :]
-        rope = rope_tables(decoding.position[:, None], self.config.vlm.head_dim, self.config.rope_base)
-        for layer, keys, values in zip(self.vlm.layers, decoding.keys, decoding.values, strict=True):
-            normed, gate = layer.input_layernorm(x)
-            k, v = layer.keys_values(normed, rope)
-            keys.index_copy_(2, decoding.place, k)
-            values.index_copy_(2, decoding.place, v)
-            x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, keys, values, mask), gate))
-        decoding.place.add_(1)
-        decoding.position.add_(1)
-        self._choose(decoding, x)
-
-    def _choose(self, decoding: Decoding, x: Tensor) -> None:
-        """The next id, by the last layer's output [B, 1, D]."""
-        weight = self.vlm.embed_tokens.weight
-        hidden = self.vlm.norm(x)[0][:, 0].to(weight.dtype)
-        decoding.logits.copy_(hidden @ weight.T)
-        decoding.chosen.copy_(decoding.logits.argmax(-1))
-        decoding.ids.index_copy_(1, decoding.count, decoding.chosen[:, None])
-        decoding.ended.logical_or_((decoding.chosen[:, None] == decoding.ends).any(1))
-        decoding.count.add_(1)
 
 
 def compacted(observation: Observation) -> Observation:

@@ -60,6 +60,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     steps: int | None = None
     solver: str | None = None
     time_grid: str | None = None
+    guidance: float | None = None
+    guidance_tag: str | None = None
     device: str = "auto"
     tokenizer: str | None = None
     default_prompt: str | None = None
@@ -102,6 +104,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             num_denoising_steps=self.steps,
             solver=self.solver,  # type: ignore[arg-type]  # checked there
             time_grid=typed_grid(self.time_grid),
+            guidance=self.guidance,
+            guidance_tag=self.guidance_tag,
             device=self.device,
             tokenizer=self.tokenizer,
             default_prompt=self.default_prompt,

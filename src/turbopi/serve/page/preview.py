@@ -8,7 +8,7 @@ from PIL import Image
 
 from turbopi.realtime.wire import unpack
 from turbopi.serve.page.messages import Preview, Thumbnail, clean
-from turbopi.support.action_groups import images_of, prompt_of
+from turbopi.support.action_groups import images_of, task_of
 
 THUMBNAIL = 224  # pixels of the longer side
 IMAGES = 4
@@ -32,7 +32,7 @@ def make_preview(
     return Preview(
         number=number,
         time=time,
-        prompt=clean(prompt_of(observation)),
+        prompt=clean(task_of(observation, reply)),
         actions=_chunk(reply.get("actions")),
         state=list(state[:NUMBERS]),
         numbers=_numbers(observation),

@@ -90,7 +90,7 @@ def train(settings: Settings) -> None:
         if len(losses) == 250:
             print(f"{time.monotonic() - started:.0f} s, step {step + 1}: {np.mean(losses):.5f}", flush=True)
             losses.clear()
-    known = dataclasses.replace(config, num_denoising_steps=1, real_time=RealTime())
+    known = dataclasses.replace(config, num_denoising_steps=1, one_step=True, real_time=RealTime())
     export(student.state(), stats(), settings.out / "checkpoint", config=known)
 
 
