@@ -2,10 +2,12 @@
 
 import base64
 import hashlib
+import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,12 @@ import pytest
 import websockets.sync.server
 from serve_fakes import NO_CHUNKS, wait_for
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import Frame, Opcode
 
 from turbopi.evaluate.sources import RemotePolicy
 from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
+from turbopi.realtime.frames import binary_head, binary_message
+from turbopi.realtime.policy_socket import _Awake
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import running
@@ -120,6 +125,72 @@ def test_what_cannot_be_sent_is_named_by_its_key_and_the_connection_stays(value:
         with pytest.raises(ObservationError, match="wrist: can't send "):
             client.infer({"place": 1, "wrist": [{"inner": value}]})
         assert client.infer({"place": 2})["actions"] == 2
+
+
+@pytest.mark.parametrize("length", [0, 1, 125, 126, 2**16 - 1, 2**16])
+def test_a_frame_made_or_read_here_is_the_librarys(length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    message = bytes(length)
+    ours = Frame(Opcode.BINARY, message).serialize(mask=False)
+    assert binary_head(length) + message == ours and binary_message(ours) == message
+    assert binary_message(ours[:-1]) is binary_message(ours + b"x") is None
+    for other in (Frame(Opcode.TEXT, message), Frame(Opcode.BINARY, message, fin=False)):
+        assert binary_message(other.serialize(mask=False)) is None
+    monkeypatch.setattr("secrets.token_bytes", bytes)
+    masked = Frame(Opcode.BINARY, message).serialize(mask=True)
+    assert binary_head(length, masked=True) + message == masked and binary_message(masked) is None
+
+
+class Pieces:
+    """A socket that gives what came in these pieces."""
+
+    def __init__(self, pieces: list[bytes]) -> None:
+        self.pieces, self.sent = pieces, b""
+
+    def recv(self, _: int) -> bytes:
+        return self.pieces.pop(0)
+
+    def sendall(self, data: bytes) -> None:
+        self.sent += data
+
+
+def test_messages_are_the_same_however_the_socket_cuts_them_and_pings_are_answered() -> None:
+    said: list[Frame] = [
+        Frame(Opcode.BINARY, b"\x82\x01a"),
+        Frame(Opcode.PING, b"\x82\x02is"),
+        Frame(Opcode.TEXT, b"no"),
+    ]
+    said += [Frame(Opcode.BINARY, bytes(130)), Frame(Opcode.BINARY, b"ha", fin=False), Frame(Opcode.CONT, b"lf")]
+    whole = b"".join(frame.serialize(mask=False) for frame in said)
+    ends = list(accumulate(len(frame.serialize(mask=False)) for frame in said))
+    cuts = [[place] for place in range(1, len(whole))] + [list(range(1, len(whole))), ends[:-1]]
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        assert client._socket is not None
+        stream, real = client._socket._stream, client._socket.socket
+        for cut in cuts:
+            pieces = Pieces([whole[begin:end] for begin, end in pairwise([0, *cut, len(whole)])])
+            with stream.using:
+                stream.socket = pieces  # type: ignore[assignment]
+                try:
+                    assert [stream.receive() for _ in range(4)] == [b"\x82\x01a", "no", bytes(130), b"half"]
+                finally:
+                    stream.socket = real
+            assert pieces.sent[:1] == b"\x8a" and not pieces.pieces and not stream._begun
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.002])
+def test_who_is_awake_for_the_answer_gets_it_sooner_or_later_than_it_is_due(
+    seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("turbopi.realtime.policy_socket.PROCESSORS", 1)
+    policy = Echo()
+    with running(policy) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        assert client._socket is not None
+        awake = client._socket._awake
+        assert isinstance(awake, _Awake) or not hasattr(os, "memfd_create")
+        for number in range(20):
+            if isinstance(awake, _Awake):
+                awake._took.append(seconds * (number % 3))
+            assert client.infer({"place": number})["actions"] == number
 
 
 def test_a_request_that_came_too_late_costs_no_connection() -> None:

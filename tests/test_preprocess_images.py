@@ -65,7 +65,7 @@ SIZES = ((480, 640), (720, 1280), (1080, 1920), (640, 480), (211, 1999), (224, 4
 def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
     monkeypatch: pytest.MonkeyPatch, way: Any, cores: int
 ) -> None:
-    monkeypatch.setattr(images, "_cores", lambda: cores)
+    monkeypatch.setattr(images, "usable_processors", lambda: cores)
     images._threads.cache_clear()
     camera_images = [noise(h, w, 3, seed=h) for h, w in SIZES]
     turned = [one.transpose(1, 0, 2) for one in camera_images]
@@ -89,7 +89,7 @@ def test_a_forked_child_has_threads_of_its_own() -> None:
     code = """
 import os, numpy as np
 from turbopi.preprocess import images
-images._cores = lambda: 2
+images.usable_processors = lambda: 2
 arrays = [np.ones((480, 640, 3), np.uint8)] * 2
 images.all_fitted(arrays, 224, "openpi")
 child = os.fork()

@@ -789,8 +789,8 @@ def test_a_message_is_taken_in_the_callback_that_brings_it_if_it_is_one_frame(ki
     async def test(server: Server) -> None:
         client, taken, done = await server.client(), list[bytes](), asyncio.get_running_loop().create_future()
 
-        def take(message: bytes) -> asyncio.Future[Any]:
-            taken.append(message)
+        def take(message: bytes | memoryview) -> asyncio.Future[Any]:
+            taken.append(bytes(message))
             return done
 
         receiving = asyncio.ensure_future(client.connection.recv_taken(take))
@@ -815,7 +815,7 @@ def test_who_waits_for_a_taken_message_hears_of_the_connections_end() -> None:
             client = await server.client()
             never: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-            def take(message: bytes, never: asyncio.Future[None] = never) -> asyncio.Future[None]:
+            def take(message: bytes | memoryview, never: asyncio.Future[None] = never) -> asyncio.Future[None]:
                 return never
 
             receiving = asyncio.ensure_future(client.connection.recv_taken(take))

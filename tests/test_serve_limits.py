@@ -149,6 +149,22 @@ def test_stopping_waits_for_no_client_that_does_not_read() -> None:
     asyncio.run(main())
 
 
+def test_a_client_that_resets_while_its_answer_waits_is_no_fault_of_the_server(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with raw(server) as bad:
+            bad.reader._transport.pause_reading()  # type: ignore[attr-defined]
+            linger = struct.pack("ii", 1, 0)  # closing resets
+            bad.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            bad.writer.write(frame(pack(observation("large actions"))))
+            await eventually(lambda: any(one.paused for one in server._listener._clients))
+        await eventually(lambda: not server._listener._connected)
+
+    served(test)
+    assert "the server failed" not in caplog.text
+
+
 @pytest.mark.slow
 def test_a_client_that_pings_and_never_reads_is_closed() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:

@@ -71,6 +71,23 @@ def test_bytes_are_those_of_openpi(name: str) -> None:
     assert pack(value) == base64.b64decode(OBJECTS[name]["packed_base64"])
 
 
+def test_arrays_are_written_as_msgpack_itself_writes_their_maps() -> None:
+    image = np.arange(2**17, dtype=np.uint8).reshape(64, 2, -1)
+    arrays: list[np.ndarray] = [np.zeros(size, np.uint8) for size in (0, 1, 255, 256, 2**16 - 1, 2**16)]
+    arrays += [image, image[::2], image.T, np.float32(1) * image[0], np.array(2.5), np.array(["é", "ab"])]
+    arrays += [np.array([True]), np.array([1], ">i2"), np.zeros((2, 0, 3)), np.array(["2026-11-29"], "M8[D]")]
+    deep: dict[str, Any] = {"array": image}
+    for _ in range(40):
+        deep = {"deeper": deep, "array": arrays[1]}
+    many = {f"{number}": arrays[number % 3] for number in range(2**16)}
+    for value in (*arrays, deep, many, {1: image, b"b": [image], "t": (1, image), "s": np.float32(-0.0), "n": None}):
+        assert pack(value) == msgpack.packb(value, default=wire._fields)
+    endless: dict[str, Any] = {"array": image}
+    endless["itself"] = endless
+    with pytest.raises(WireError, match="can't send this value: "):
+        pack(endless)
+
+
 @pytest.mark.parametrize("name", OBJECTS)
 def test_openpi_bytes_decode_to_the_value_that_was_packed(name: str) -> None:
     item = OBJECTS[name]

@@ -30,6 +30,24 @@ def observation(prompt: str, seed: int = 0, pixels: int = 100) -> dict[str, Any]
     return {"observation/image": image, "observation/state": np.linspace(-1, 1, 8), "prompt": prompt}
 
 
+class InPlace(FakePolicy):
+    """Keeps no image: `saw` is a copy of the last one, after `before`."""
+
+    reads_in_place = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.before: Callable[[], object] = lambda: None
+        self.saw = np.zeros(0)
+
+    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+        self.before()
+        self.saw = obs["observation/image"].copy()
+        answer = super().infer(obs)
+        self.observations = {prompt: {**kept, "observation/image": None} for prompt, kept in self.observations.items()}
+        return answer
+
+
 def shares(client: RealTimeClient) -> bool:
     return client._socket is not None and client._socket._memory is not None
 
@@ -83,6 +101,28 @@ def test_a_slot_that_is_overwritten_while_the_policy_runs_changes_nothing() -> N
         policy.infer = overwritten  # type: ignore[method-assign]
         client.infer(observation("one"))
         assert np.array_equal(policy.observations["one"]["observation/image"], observation("one")["observation/image"])
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_policy_that_keeps_no_image_reads_them_where_they_lie_but_for_a_recording(
+    recorded: bool, tmp_path: Path
+) -> None:
+    policy = InPlace()
+    with (
+        running(policy, record_dir=tmp_path if recorded else None) as server,
+        RealTimeClient("127.0.0.1", server.port) as client,
+    ):
+        for seed in (2, 3):  # from the third on, messages look like one before
+            client.infer(observation("six", seed))
+        assert client._socket is not None and client._socket._memory is not None
+        memory = client._socket._memory._memory
+        policy.before = lambda: memory.__setitem__(slice(BEGIN, None), bytes(len(memory) - BEGIN))
+        wait_for(lambda: bool(server._idle))  # a request that comes sooner is copied
+        client.infer(observation("six", 1))
+    image = observation("six", 1)["observation/image"]
+    assert np.array_equal(policy.saw, image if recorded else 0 * image)
+    kept = policy.observations["six"]  # nothing but the image changes with the memory
+    assert np.array_equal(kept["observation/state"], np.linspace(-1, 1, 8)) and kept["prompt"] == "six"
 
 
 def refuse(*_: Any, **__: Any) -> Any:
@@ -143,11 +183,18 @@ def test_a_slot_is_no_longer_than_a_message_may_be() -> None:
             client.infer(observation("too long", pixels=200))
 
 
-def test_a_client_that_leaves_leaves_nothing_behind() -> None:
-    before, policy = files(), FakePolicy()
+@pytest.mark.parametrize("make", [FakePolicy, InPlace])
+def test_a_client_that_leaves_leaves_nothing_behind(make: Callable[[], FakePolicy]) -> None:
+    before, policy = files(), make()
     with running(policy) as server:
         for leaves in ("at once", "in its request"):
             client = RealTimeClient("127.0.0.1", server.port)
+            policy.release.set()
+            for _ in range(2):  # from the third on, messages look like one before
+                client.infer(observation("hold"))
+            policy.release.clear()
+            policy.started.clear()
+            wait_for(lambda: bool(server._idle))
             assert client._socket is not None and client._socket._memory is not None
             if leaves == "in its request":
                 message = client._socket._memory.put([pack(observation("hold"))])
@@ -175,7 +222,12 @@ def test_after_a_restart_the_client_shares_the_new_servers_memory() -> None:
 
 
 def slots_message(slots: SharedSlots, slot: int, length: int) -> bytes | None:
-    return slots.message(struct.pack(">BBI", 0xC1, slot, length))
+    return message_in(slots, struct.pack(">BBI", 0xC1, slot, length))
+
+
+def message_in(slots: SharedSlots, bell: bytes | None) -> bytes | None:
+    message = slots.message(bell or b"")
+    return None if message is None else bytes(message)
 
 
 def test_only_what_lies_in_a_slot_is_read_from_it() -> None:
@@ -236,9 +288,9 @@ def test_a_slot_is_used_again_two_messages_later() -> None:
     assert isinstance(client, SharedWriter)
     sent = [bytes([number]) * (MIN_BYTES + number) for number in range(5)]
     bells = [client.put([message[:100], memoryview(message)[100:]]) for message in sent[:2]]
-    assert [slots.message(bell or b"") for bell in bells] == sent[:2]
+    assert [message_in(slots, bell) for bell in bells] == sent[:2]
     assert client.put([bytes(MIN_BYTES - 1)]) is None and client.put([bytes(40_001)]) is None
     for message in sent[2:]:
-        assert slots.message(client.put([message]) or b"") == message
+        assert message_in(slots, client.put([message])) == message
     client.close()
     slots.close()

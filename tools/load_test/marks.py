@@ -31,7 +31,9 @@ MARKS = (
     Mark("packed", "client", "websockets.sync.connection:Connection.send", True, "pack"),
     Mark("packed", "client", "turbopi.realtime.policy_socket:PolicySocket.ask", True, "pack"),
     Mark("written", "client", "turbopi.realtime.policy_socket:_Stream.send", True, "write into shared memory"),
+    Mark("written", "client", "turbopi.realtime.policy_socket:_Stream.ring", True, "write into shared memory"),
     Mark("masked", "client", "websockets.frames:apply_mask", False, "mask"),
+    Mark("masked", "client", "turbopi.realtime.policy_socket:binary_head", False, "mask"),
     Mark("woken", "server", "turbopi.serve.connection:GuardedConnection.buffer_updated", True, "wake the server"),
     Mark("received", "server", "websockets.frames:apply_mask", True, "receive"),
     Mark("unmasked", "server", "websockets.frames:apply_mask", False, "unmask"),
@@ -44,12 +46,12 @@ MARKS = (
     Mark("launch", "server", "turbopi.engine.graph:Graph.launch", True, "infer: to the first launch"),
     Mark("model", "server", "turbopi.policy.model_call:ModelCall.run", False, "infer: to the model's end"),
     Mark("inferred", "server", "turbopi.serve.calls:PolicyCalls._result", False, "infer: to its end"),
-    Mark("ended", "server", "turbopi.serve.worker:Worker._ended", True, "hand over to the event loop"),
-    Mark("answered", "server", "turbopi.serve.requests:RequestHandler._answer", True, "event loop, to the answer"),
+    Mark("answered", "server", "turbopi.serve.requests:RequestHandler._answer", True, "hand over, to the answer"),
     Mark("made", "server", "turbopi.serve.requests:pack", False, "answer, pack"),
     Mark("made", "server", "turbopi.serve.server:pack", False, "answer, pack"),
     Mark("heard", "client", "websockets.sync.connection:Connection.process_event", True, "send, wake the client"),
     Mark("heard", "client", "websockets.protocol:Protocol.receive_data", True, "send, wake the client"),
+    Mark("heard", "client", "turbopi.realtime.policy_socket:binary_message", True, "send, wake the client"),
     Mark("given", "client", "turbopi.realtime.policy_socket:PolicySocket.ask", False, "hand over to the caller"),
     Mark("given", "client", "websockets.sync.connection:Connection.recv", False, "hand over to the caller"),
     Mark("end", "client", "load_test.marks:infer", False, "unpack"),
@@ -98,6 +100,8 @@ def _noting(function: Callable[..., Any], begins: Sequence[list[float]], ends: S
 
 class NoTime:
     """A policy that takes no time, or sleeps for a model's."""
+
+    reads_in_place = True
 
     def __init__(self, work_s: float) -> None:
         self.metadata: dict[str, Any] = {"policy": "no time", "robot": "libero", "action_horizon": 10}

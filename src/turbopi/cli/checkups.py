@@ -19,6 +19,7 @@ from turbopi.cli.ports import why_not_free
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import TurboPiError
 from turbopi.support.installation import install_command
+from turbopi.support.processors import usable_processors
 from turbopi.support.toolchain import missing_for_c, missing_for_cpp
 
 MIN_PYTHON, MIN_TORCH = (3, 10), "2.8"
@@ -114,7 +115,7 @@ def check_cpu() -> Row:
 
     torch = imported_torch()
     cores = psutil.cpu_count(logical=False)
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    usable = usable_processors()
     threads = None if torch is None else torch.get_num_threads()
     found = f"{cores or '?'} cores, {usable} usable CPUs, PyTorch uses {threads} threads"
     if threads is not None and threads > usable:

@@ -572,6 +572,11 @@ class UnifiedPolicy:
     gives_readings = True  # to the server: `infer`, `infer_batch` and `submit` take `readings`
 
     @property
+    def reads_in_place(self) -> bool:
+        """To the server: whether images are copied by the end of a call, and none is kept, as of an episode."""
+        return self._history is None
+
+    @property
     def pipelined(self) -> bool:
         """Whether `submit` overlaps observations; the server uses it then."""
         return self.backend.submits

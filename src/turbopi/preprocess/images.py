@@ -25,6 +25,7 @@ from torch import Tensor
 
 from turbopi.config import ImageResize
 from turbopi.support.errors import ObservationError
+from turbopi.support.processors import usable_processors
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def all_fitted(camera_images: Sequence[np.ndarray], size: int, resize: ImageResi
     has PyTorch's.
     """
     large = max((one.size for one in camera_images), default=0) > LARGE
-    if _cores() == 1 or len(camera_images) == 1 or WAYS[resize].float_images or not large:
+    if usable_processors() == 1 or len(camera_images) == 1 or WAYS[resize].float_images or not large:
         return [fitted(one, size, resize) for one in camera_images]
     for one in camera_images:
         placement(one.shape, (size, size, 3))  # refuses before anything starts
@@ -87,16 +88,11 @@ def all_fitted(camera_images: Sequence[np.ndarray], size: int, resize: ImageResi
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_cores(), "turbopi-images")
+    return ThreadPoolExecutor(usable_processors(), "turbopi-images")
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)  # a child has no threads but the one that forked
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -143,7 +143,7 @@ class RealTimeClient:
     def _watch_memory(self, answer: Mapping[str, Any], begins: bool) -> None:
         """Warn if the server's history of this robot began anew within an episode, as after a lost connection."""
         memory = answer.get("memory")
-        if not isinstance(memory, Mapping) or not isinstance(recorded := memory.get("observations"), int):
+        if not isinstance(memory, dict) or not isinstance(recorded := memory.get("observations"), int):
             return
         if not begins and recorded <= self._recorded:
             logger.warning(
@@ -321,11 +321,15 @@ def _packed(sent: Mapping[str, Any]) -> Parts:
 
 def _writable(value: Any) -> Any:
     """The same with arrays that may be written to: those of a message are views of it, or of read-only bytes."""
-    if isinstance(value, dict):
-        return {key: _writable(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_writable(item) for item in value]
-    return value.copy() if isinstance(value, np.ndarray) else value
+    kind = type(value)
+    if kind is dict:
+        return {key: _writable(item) if type(item) in _HOLD_ARRAYS else item for key, item in value.items()}
+    if kind is list:
+        return [_writable(item) if type(item) in _HOLD_ARRAYS else item for item in value]
+    return value.copy() if kind is np.ndarray else value
+
+
+_HOLD_ARRAYS = frozenset((dict, list, np.ndarray))
 
 
 def _keep_freed_memory() -> None:

@@ -80,6 +80,9 @@ def keeps_episode(metadata: Mapping[str, Any]) -> bool:
     return "memory" in metadata or "subtasks" in metadata
 
 
+PLAIN = CallOptions()
+
+
 def message(
     observation: Mapping[str, Any],
     previous: RunningChunk | None = None,
@@ -110,11 +113,16 @@ def message(
     return {**observation, **{PREFIX + key: value for key, value in options.items()}}
 
 
+def is_plain(received: Mapping[str, Any]) -> bool:
+    """Whether a message holds the observation alone, as those of openpi's clients do."""
+    return not [key for key in received if key.startswith(PREFIX)]  # half of `any`'s time
+
+
 def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], CallOptions]:
     """The observation alone, and the options beside it. Raises ObservationError for values that can't be right."""
+    if is_plain(received):
+        return dict(received), PLAIN
     observation = {key: value for key, value in received.items() if not key.startswith(PREFIX)}
-    if len(observation) == len(received):
-        return observation, CallOptions()
     given = {key.removeprefix(PREFIX): value for key, value in received.items() if key.startswith(PREFIX)}
     unknown = sorted(set(given) - set(KEYS))
     if unknown:

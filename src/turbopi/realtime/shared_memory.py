@@ -3,7 +3,8 @@
     client   asks for it with a header of its websocket's HTTP request
     server   makes a file without a name (memfd_create) of SLOTS slots, and answers with a header that says where it is
     client   opens /proc/<pid>/fd/<descriptor>; writes each message into the next slot, and sends which one and how long
-    server   copies the message out of the slot: from there on it is as if it had come through the socket
+    server   copies the message out of the slot, but for images where the policy copies these itself and keeps none:
+             from there on it is as if it had come through the socket
 
 The kernel lets only processes of the server's user open the descriptor. What the client can't open, because it is on
 another host, in another container or another user's, it does without: messages go through the socket, as they do for
@@ -60,19 +61,23 @@ class SharedSlots:
         """The response's header."""
         return f"{os.getpid()} {self._file} {self._slot_bytes} {self._token.hex()}"
 
-    def message(self, received: bytes) -> bytes | None:
-        """The message that `received` says is in a slot; None: it says no such thing, and is a message itself."""
+    def message(self, received: bytes) -> memoryview | None:
+        """The message that `received` says is in a slot, and that the client may change there at any time.
+
+        None: it says no such thing, and is a message itself.
+        """
         if len(received) != _DOORBELL.size or received[0] != _BELL:
             return None
         _, slot, length = _DOORBELL.unpack(received)
         if slot >= SLOTS or length > self._slot_bytes:
             return None
         begin = BEGIN + slot * self._slot_bytes
-        return self._memory[begin : begin + length]
+        return memoryview(self._memory)[begin : begin + length]
 
     def close(self) -> None:
-        """Free the memory, once the client has closed it, too."""
-        self._memory.close()
+        """Free the memory, once the client has closed it, too, and the call that reads an image in it has ended."""
+        with contextlib.suppress(BufferError):
+            self._memory.close()
         os.close(self._file)
 
 

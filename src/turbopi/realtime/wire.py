@@ -15,8 +15,10 @@ besides copying bytes is bounded too: a few milliseconds for the worst message. 
 import math
 import re
 import reprlib
-import secrets
 import struct
+import threading
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import msgpack
@@ -62,39 +64,54 @@ def pack(value: object) -> bytes:
 
 def pack_parts(value: object) -> list[bytes | memoryview]:
     """`pack`, as parts to write one after the other: the numbers of large arrays are views, and aren't copied."""
-    large: list[memoryview] = []
-
-    def pack_numpy(value: object) -> dict[bytes, object]:
-        fields = _pack_numpy(value)
-        if isinstance(data := fields[b"data"], memoryview):
-            fields[b"data"] = msgpack.ExtType(0, _PLACE.pack(_NONCE, len(large)))
-            large.append(data)
-        return fields
-
+    parts: list[bytes | memoryview] = []
     try:
-        packed = msgpack.packb(value, default=pack_numpy)
+        _add_parts(value, parts, _PACKER.packer.pack, 0)
     except WireError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError(f"can't send this value: {error}") from error
-    assert isinstance(packed, bytes)
-    parts: list[bytes | memoryview] = []
-    for number, data in enumerate(large):
-        before, _, packed = packed.partition(b"\xd8\0" + _PLACE.pack(_NONCE, number))
-        parts += (before + _bin_head(data.nbytes), data)
-    return [*parts, packed]
+    return parts
 
 
-def _bin_head(size: int) -> bytes:
-    """What msgpack has in front of so many bytes."""
-    power = 0 if size < 2**8 else 1 if size < 2**16 else 2
-    return bytes([_BINS[power]]) + size.to_bytes(1 << power, "big")
+def _add_parts(value: object, parts: list[bytes | memoryview], packed: Callable[[object], bytes], depth: int) -> None:
+    """Add what `value` is in the format. Arrays elsewhere than in maps, and those far inside, are copied."""
+    if isinstance(value, np.ndarray):
+        _check_dtype(value.dtype)
+        head, tail = _around(value.dtype, value.shape)
+        parts += (head, _bytes_of(value), tail)
+    elif type(value) is dict and depth < MAX_DEPTH and not _PLAIN.issuperset(map(type, value.values())):
+        parts.append(_head(_MAPS, len(value)))
+        for key, item in value.items():
+            parts.append(packed(key))
+            _add_parts(item, parts, packed, depth + 1)
+    else:
+        parts.append(packed(value))
 
 
-_NONCE, _PLACE = secrets.token_bytes(12), struct.Struct(">12sI")  # what stands for a large array meanwhile: fixext 16
+@lru_cache(maxsize=256)
+def _around(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bytes]:
+    """What is in front of an array's numbers, and what follows them."""
+    pack = msgpack.Packer().pack
+    front = _head(_MAPS, 4) + b"".join(map(pack, (b"__ndarray__", True, b"data")))
+    after = b"".join(map(pack, (b"dtype", dtype.str, b"shape", shape)))
+    return front + _head(_BINS, math.prod(shape) * dtype.itemsize), after
 
 
-def _pack_numpy(value: object) -> dict[bytes, object]:
+def _head(kinds: tuple[int, int, int], size: int) -> bytes:
+    """msgpack's header of a map or bin of that size."""
+    if kinds is _MAPS and size < 16:
+        return bytes((kinds[0] + size,))
+    power = 0 if kinds is _BINS and size < 2**8 else 1 if size < 2**16 else 2
+    return bytes((kinds[power],)) + size.to_bytes(1 << power, "big")
+
+
+_MAPS, _BINS = (0x80, 0xDE, 0xDF), (0xC4, 0xC5, 0xC6)
+_PLAIN = frozenset((str, bytes, bool, int, float, type(None)))
+
+
+def _fields(value: object) -> dict[bytes, object]:
+    """What msgpack packs in place of what it doesn't know."""
     if isinstance(value, int):  # msgpack asks about what it can't hold
         raise WireError(f"can't send the integer {_shown(value)}: the format's integers have 64 bits")
     if not isinstance(value, np.ndarray | np.generic):
@@ -103,14 +120,18 @@ def _pack_numpy(value: object) -> dict[bytes, object]:
             "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays. Send a tensor or an image "
             "as a numpy array"
         )
-    if value.dtype.kind in _REFUSED_KINDS:
-        raise WireError(f"can't send dtype {value.dtype}: void, object and complex aren't part of the format")
+    _check_dtype(value.dtype)
     if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": _bytes_of(value), b"dtype": value.dtype.str, b"shape": value.shape}
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     item = value.item()
     if not isinstance(item, bool | int | float) or isinstance(item, np.generic):
         raise WireError(f"can't send a {value.dtype} scalar: send it as a 0-dimensional array")
     return {b"__npgeneric__": True, b"data": item, b"dtype": value.dtype.str}
+
+
+def _check_dtype(dtype: np.dtype[Any]) -> None:
+    if dtype.kind in _REFUSED_KINDS:
+        raise WireError(f"can't send dtype {dtype}: void, object and complex aren't part of the format")
 
 
 def _bytes_of(array: np.ndarray) -> bytes | memoryview:
@@ -118,6 +139,16 @@ def _bytes_of(array: np.ndarray) -> bytes | memoryview:
     if array.nbytes < LARGE or not array.flags.c_contiguous:
         return array.tobytes()
     return array.reshape(-1).view(np.uint8).data
+
+
+class _ThreadsPacker(threading.local):
+    """msgpack's, of each thread: to make one takes longer than to use it."""
+
+    def __init__(self) -> None:
+        self.packer = msgpack.Packer(default=_fields)
+
+
+_PACKER = _ThreadsPacker()
 
 
 # --- decoding ---------------------------------------------------------------------------------------------------------
@@ -161,10 +192,14 @@ class Unpacker:
         self._size = -1
         self._like: _Alike | None = None
 
-    def unpack(self, data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
-        """What `unpack` returns or raises."""
+    def unpack(self, data: bytes | memoryview, *, max_bytes: int = MAX_BYTES) -> Any:
+        """What `unpack` returns or raises.
+
+        In a memoryview only images may change meanwhile: they are views of it, or of a copy.
+        """
         if self._like is not None and (value := self._like.filled(data)) is not None:
             return value
+        data = bytes(data)
         value, again = unpack(data, max_bytes=max_bytes), len(data) == self._size
         self._size, self._like = len(data), _Alike.of(data, value) if again else None  # not of what comes only once
         return value
@@ -201,7 +236,6 @@ def _head_table() -> tuple[tuple[int, int, int], ...]:
 
 
 _HEADS = _head_table()
-_BINS = (0xC4, 0xC5, 0xC6)
 _EXTENSION = struct.Struct(">BBI")  # head, type and four bytes of data
 # First bytes by the length of what they begin: a run of those is found at once, not value by value.
 _SAME_LENGTH = {
@@ -439,15 +473,18 @@ class _Alike:
         assert end == len(data)
         return cls(data, skeleton, holes) if len(data) - sum(end - begin for begin, end, *_ in holes) < LARGE else None
 
-    def filled(self, data: bytes) -> dict[str, Any] | None:
+    def filled(self, data: bytes | memoryview) -> dict[str, Any] | None:
         """The value of `data`; None if it doesn't look like this message."""
-        if len(data) != self._size or any(data[begin:end] != same for begin, end, same in self._same):
+        if len(data) != self._size:
             return None
+        for begin, end, same in self._same:
+            if data[begin:end] != same:
+                return None
         whole = memoryview(data)
         values = [
             _DOUBLE.unpack_from(data, begin)[0]
             if dtype is None
-            else np.ndarray(shape, dtype, whole[begin:end] if dtype.itemsize == 1 else data[begin:end])
+            else np.ndarray(shape, dtype, whole[begin:end] if dtype.itemsize == 1 else bytes(data[begin:end]))
             for begin, end, dtype, shape in self._holes
         ]
         return _filled(self._value, values)

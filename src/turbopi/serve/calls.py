@@ -47,6 +47,9 @@ class Policy(Protocol):
     requests run one by one. With "subtasks" it has `new_history()`, and its `infer` takes `history` and `subtask`; with
     "text" it has `generate(obs, prompt=…, max_tokens=…)`.
 
+    With a true `reads_in_place` it is done with an observation's images when it returns: the client may write the next
+    ones over them.
+
     With a true `gives_readings`, all three are given `readings=True`, and their results hold a
     `turbopi.policy.readings.Reading` of the call under "reading", of which the server makes notes.
     """
@@ -204,8 +207,9 @@ class PolicyCalls:
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
         request.call = _Call([observation], arguments, request.answer)
-        request.joins = bool(arguments.keys() - {"seed", "guidance", "history", "subtask", *ALONE})
-        request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
+        if arguments:
+            request.joins = bool(arguments.keys() - {"seed", "guidance", "history", "subtask", *ALONE})
+            request.alone = request.alone or not self._may_share(arguments)
         results = self.worker.submit(request)
         if self._pipelined and not arguments:
             results.add_done_callback(self._record_seconds)

@@ -23,6 +23,7 @@ from websockets.protocol import Event, State
 from websockets.server import ServerProtocol
 
 from turbopi.policy.watch import Watch
+from turbopi.realtime.frames import binary_head
 from turbopi.realtime.shared_memory import HEADER, WANTED, SharedSlots
 from turbopi.realtime.wire import Unpacker
 from turbopi.serve.limited_log import LimitedLog, peer
@@ -50,6 +51,7 @@ class Shared:
     memory: MemoryBudget = field(init=False)
     pool: WorkPool = field(init=False)
     slots: int = field(default=0, init=False)  # clients with shared memory
+    in_place: bool = False  # the policy reads images where the client wrote them
     spare: SpareBuffer = field(default_factory=SpareBuffer, init=False)
     # One for all connections: what one read brought is handled before the next read.
     scratch: memoryview = field(default_factory=lambda: memoryview(bytearray(READ_BYTES)), init=False)
@@ -91,6 +93,9 @@ def frame_head(data: bytes | memoryview, at: int) -> FrameHead | None:
     return FrameHead(size, length, first & 0x0F, bool(first & 0x80), is_zero_copy(first, second, length))
 
 
+Take = Callable[["bytes | memoryview"], "asyncio.Future[Any] | None"]  # see `GuardedConnection.recv_taken`
+
+
 @dataclass
 class _Message:
     """What a message has cost so far."""
@@ -125,8 +130,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._handed_over = 0  # bytes of messages
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._writing = threading.RLock()  # for the socket; other threads write to it in `send_at_once` alone
-        self._take: Callable[[bytes], asyncio.Future[Any] | None] | None = None
-        self._waiter: asyncio.Future[bytes | None] | None = None
+        self._take: Take | None = None
+        self._waiter: asyncio.Future[bytes | memoryview | None] | None = None
         self._slots: SharedSlots | None = None
         self._unsent: bytes | memoryview = b""  # what the socket didn't take there
         self._descriptor: int | None = None
@@ -182,7 +187,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         near, far = (self.transport.get_extra_info(name) for name in ("sockname", "peername"))
         return bool(near and far) and near[0] == far[0]
 
-    async def recv_taken(self, take: "Callable[[bytes], asyncio.Future[Any] | None]") -> str | bytes:
+    async def recv_taken(self, take: "Take") -> str | bytes | memoryview:
         """`recv`, but `take` has the message at once, in the callback that received it, if it comes in one frame.
 
         If it returns a Future, this returns the message when that is done: nothing is done for it before. It may not
@@ -199,7 +204,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                 return message
         return await self.recv()
 
-    def _wake(self, message: bytes | None) -> None:
+    def _wake(self, message: bytes | memoryview | None) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(message)
 
@@ -208,7 +213,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
         The caller sees to it that nothing else is sent on this connection meanwhile, but for what the library sends.
         """
-        frame = Frame(Opcode.BINARY, message).serialize(mask=False)
+        frame = binary_head(len(message)) + message
         with self._writing:  # without the lock the descriptor might be another connection's by now
             if self._descriptor is None or self.protocol.state is not State.OPEN or self.transport.is_closing():
                 return False
@@ -332,13 +337,15 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         if self._take is not None and isinstance(event, Frame) and event.opcode < Opcode.CLOSE:
             take, self._take = self._take, None
             if event.opcode is Opcode.BINARY and event.fin and len(event.data) < MAX_BYTES:
-                message = bytes(event.data)
+                message = event.data if type(event.data) is memoryview else bytes(event.data)
                 if (until := take(message)) is None:
                     self._wake(message)
                 else:
                     until.add_done_callback(lambda _: self._wake(message))
                 return
             self._wake(None)
+        if isinstance(event, Frame) and type(event.data) is memoryview:
+            event = Frame(Opcode.BINARY, bytes(event.data))
         super().process_event(event)
 
     def _from_slot(self, frame: Frame, slots: SharedSlots) -> Frame:
@@ -349,7 +356,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         work = len(message) / BYTES_OF_ONE_WORK
         self._credit.spend(work)
         self._unanswered[-1].work += work
-        return Frame(Opcode.BINARY, message)
+        return Frame(Opcode.BINARY, message if self._shared.in_place else bytes(message))
 
     # --- what comes in ------------------------------------------------------------------------------------------------
 
@@ -375,7 +382,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         elif self.paused:
             blocked = True  # it doesn't read what it is sent: what it sends would only lead to more
         else:
-            self._cancel("retry")
+            if self._timers:
+                self._cancel("retry")
             self._credit.refill()
             blocked = self._scan()
         self._set_reading(not blocked)
@@ -398,7 +406,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                     break
                 self._payload_left = head.length
                 if begins and head.zero_copy and head.length <= self._limits.message_bytes:
-                    self._hand_over(data[begun:at])
+                    if at > begun:
+                        self._hand_over(data[begun:at])
                     begun = at + head.size
                     mask, end = bytes(data[begun - 4 : begun]), begun + head.length
                     if end <= len(data):  # it is here as a whole

@@ -28,8 +28,9 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
+from turbopi.realtime.frames import binary_head
 from turbopi.realtime.wire import Unpacker, WireError, unpack
-from turbopi.serve.connection import DISCARD_PAUSE_SECONDS, GuardedConnection, Owner, Shared
+from turbopi.serve.connection import DISCARD_PAUSE_SECONDS, GuardedConnection, Owner, Shared, Take
 from turbopi.serve.json_messages import from_json, to_json
 from turbopi.serve.limited_log import peer
 from turbopi.serve.limits import Credit
@@ -119,8 +120,8 @@ class PortConnection(GuardedConnection):
         if self._post is None:
             super().offer_memory(request, response)
 
-    async def recv_taken(self, take: Callable[[bytes], "asyncio.Future[Any] | None"]) -> str | bytes:
-        received: str | bytes = await (super().recv_taken(take) if self._post is None else self.recv())
+    async def recv_taken(self, take: Take) -> str | bytes | memoryview:
+        received: str | bytes | memoryview = await (super().recv_taken(take) if self._post is None else self.recv())
         return received
 
     def send_at_once(self, message: bytes) -> bool:
@@ -269,7 +270,7 @@ class Post(asyncio.Protocol):
             if isinstance(event, Response) and self._client.state is State.OPEN:
                 if self._http.they_are_waiting_for_100_continue:
                     self._write(h11.InformationalResponse(status_code=100, headers=[]))
-                self._connection.data_received(_frame_head(self._length))
+                self._connection.data_received(binary_head(self._length, masked=True))
                 self._loop.call_soon(self._advance)
             elif isinstance(event, Response):
                 status = HTTPStatus(event.status_code)
@@ -416,13 +417,5 @@ class _Unreadable(Unpacker):
         super().__init__()
         self._error = error
 
-    def unpack(self, data: bytes, *, max_bytes: int = 0) -> Any:
+    def unpack(self, data: bytes | memoryview, *, max_bytes: int = 0) -> Any:
         raise self._error
-
-
-def _frame_head(length: int) -> bytes:
-    """Of a client's binary frame, with a mask of zeros."""
-    if length < 126:
-        return bytes([0x82, 0x80 | length]) + bytes(4)
-    size = 2 if length < 2**16 else 8
-    return bytes([0x82, 0xFE if size == 2 else 0xFF]) + length.to_bytes(size, "big") + bytes(4)

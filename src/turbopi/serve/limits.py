@@ -141,9 +141,10 @@ class Credit:
     def refill(self) -> None:
         """Count what has come back meanwhile."""
         now = self._clock()
-        self._level = min(self._burst, self._level + (now - self._at) * self._current_rate())
+        rate = self._current_rate() if self._slowed else self._rate
+        self._level = min(self._burst, self._level + (now - self._at) * rate)
         self._at = now
-        if self._level >= self._burst / 5:  # not at once: it would never share
+        if self._slowed and self._level >= self._burst / 5:  # not at once: it would never share
             self._set_slowed(False)
 
     def wait(self) -> float:

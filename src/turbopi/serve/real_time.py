@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 
 from turbopi.realtime import DelayEstimate
-from turbopi.realtime.messages import KEYS, PREFIX, SCHEDULING_KEYS, CallOptions, keeps_episode, read_message
+from turbopi.realtime.messages import (
+    KEYS,
+    PLAIN,
+    PREFIX,
+    SCHEDULING_KEYS,
+    CallOptions,
+    is_plain,
+    keeps_episode,
+    read_message,
+)
 from turbopi.realtime.queue import default_execution_horizon
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
@@ -57,7 +66,7 @@ class Plan:
 
     observation: dict[str, Any]
     arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
-    requested: CallOptions = field(default_factory=CallOptions)
+    requested: CallOptions = PLAIN
     session: _Session | None = None
     name: str | None = None  # of the session
     received: float = 0.0
@@ -134,7 +143,7 @@ class RealTime:
 
     def plan(self, received: Mapping[str, Any], connection: Hashable) -> Plan:
         """What to do with a request that has just come. Raises ObservationError."""
-        if self._options.execution is None and not any(key.startswith(PREFIX) for key in received):
+        if self._options.execution is None and is_plain(received):
             return Plan(dict(received))
         now = self._clock()
         mode = received.get(PREFIX + "mode")

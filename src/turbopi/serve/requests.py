@@ -9,7 +9,6 @@ docs/dev/request.md follows one observation all the way; docs/serving_sessions.m
 """
 
 import asyncio
-import contextlib
 import re
 import time
 from collections import OrderedDict
@@ -31,6 +30,7 @@ from turbopi.realtime.messages import (
     Note,
     as_name,
     as_number,
+    is_plain,
     notes_in,
 )
 from turbopi.realtime.wire import Unpacker, WireError, pack
@@ -192,7 +192,7 @@ class ClientRequest:
             deadline=queued + scheduling.deadline,
             firm=scheduling.firm,
             priority=scheduling.priority,
-            source=connection.id,
+            source=connection.id.int,  # a UUID is hashed by Python
             slowed=connection.slowed,
             session=self.plan.name,
             rows=rows,
@@ -228,10 +228,11 @@ class RequestHandler:
         self._calls, self._real_time, self._metrics, self._options = calls, real_time, metrics, options
         self._max_bytes, self._strict, self._why_lost = max_bytes, strict, why_lost
         self._histories = histories
+        self._usual = read_scheduling({}, options.deadline_ms)
         self._watches: OrderedDict[str, Watch] = OrderedDict()  # of named sessions, the last used one at the end
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
 
-    async def take(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+    async def take(self, connection: GuardedConnection, message: str | bytes | memoryview, arrived: float) -> "Begun":
         """`begin`, of a message of any size."""
         if len(message) < LARGE:
             return self.begin(connection, message, arrived)
@@ -241,7 +242,7 @@ class RequestHandler:
         connection.took(time.perf_counter() - started)
         return self._begin(connection, decoded.result, arrived)
 
-    def begin(self, connection: GuardedConnection, message: str | bytes, arrived: float) -> "Begun":
+    def begin(self, connection: GuardedConnection, message: str | bytes | memoryview, arrived: float) -> "Begun":
         """Submit the request that a message holds, without waiting. For its results call `finish`, or `drop`."""
         return self._begin(connection, partial(self._decode, connection, message), arrived)
 
@@ -274,7 +275,7 @@ class RequestHandler:
         """End the decoding thread. It isn't waited for."""
         self._decoder.shutdown(wait=False)
 
-    def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
+    def _decode(self, connection: GuardedConnection, message: str | bytes | memoryview) -> dict[str, Any]:
         """The message as a map. Raises WireError."""
         started = time.perf_counter()
         try:
@@ -284,8 +285,10 @@ class RequestHandler:
 
     def read(self, received: Mapping[str, Any], connection: GuardedConnection, arrived: float) -> ClientRequest:
         """Raises ObservationError for keys and values that can't be right."""
-        scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
-        connection.robot = read_robot(received) or connection.robot
+        scheduling = self._usual
+        if not is_plain(received):
+            scheduling = read_scheduling(received, self._options.deadline_ms, self._options.control_hz)
+            connection.robot = read_robot(received) or connection.robot
         if scheduling.batch is None:
             plan = self._real_time.plan(received, connection)
             connection.robot = connection.robot or plan.name or connection.posted
@@ -366,11 +369,16 @@ class RequestHandler:
         return Reply(self._answer(request, results), request.scheduling, noted, state)
 
     def _answer_at_once(self, request: ClientRequest, result: Result) -> None:
-        """Send the reply from the policy's thread, if that can be done now."""
+        """Send the reply, if there is one and that can be done now: not by the task of its connection, but sooner."""
+        if request.reply is not None or result.error is not None:
+            return
         request.reply = reply = self._reply(request, [result])
-        with contextlib.suppress(WireError):  # the event loop's thread says so
-            if request.connection.send_at_once(pack(reply.result)):
-                request.reply = reply._replace(sent=time.perf_counter())
+        try:
+            packed = pack(reply.result)
+        except WireError:  # the event loop's thread says so
+            return
+        if request.connection.send_at_once(packed):
+            request.reply = reply._replace(sent=time.perf_counter())
 
     def _note(self, request: ClientRequest, results: Sequence[Result]) -> list[Note]:
         """Put notes in place of the readings of a request's answers. Returns those that the log hasn't said yet."""
@@ -419,8 +427,8 @@ class RequestHandler:
         """The map to send, of results that all have actions; with "server_timing"."""
         answers = [result.answer for result in results if result.answer is not None]
         runs = list({result.run: result for result in results}.values())
-        server_timing: dict[str, float] = {"infer_ms": sum(run.seconds for run in runs) * 1e3}
-        if (largest := max(run.batch for run in runs)) > 1:
+        server_timing: dict[str, float] = {"infer_ms": sum([run.seconds for run in runs]) * 1e3}
+        if (largest := max([run.batch for run in runs])) > 1:
             server_timing["batch"] = largest
         if request.connection.cycle_s is not None:
             server_timing["prev_total_ms"] = request.connection.cycle_s * 1e3
@@ -433,14 +441,14 @@ class RequestHandler:
         return {**stacked, NOTES: noted[:MOST_NOTES]} if noted else stacked
 
 
-def decode(message: str | bytes, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
+def decode(message: str | bytes | memoryview, max_bytes: int, unpacker: Unpacker) -> dict[str, Any]:
     """The map that a message holds. Raises WireError."""
     if isinstance(message, str):
         raise WireError("a request is a binary frame with a msgpack map, not a text frame")
     observation = unpacker.unpack(message, max_bytes=max_bytes)
     if not isinstance(observation, dict):
         raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
-    if not all(isinstance(key, str) for key in observation):
+    if not {str}.issuperset(map(type, observation)):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
 

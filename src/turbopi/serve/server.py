@@ -24,6 +24,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ from turbopi.serve.requests import (
     ClientRequest,
     PolicyFailed,
     Refusal,
+    Reply,
     RequestHandler,
     batch_row,
 )
@@ -68,6 +70,9 @@ LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /health
 # Seconds after which a thread that computes lets another one go on that waits to. Python's 5 ms are long for answers
 # that wait while the policy's thread reads a batch, and for that thread while the event loop reads what comes.
 SWITCH_SECONDS = 0.0005
+# After an answer, until it is counted, shown and recorded. By then a client that goes on at once has its next turn, and
+# so has a batch of them: it needn't wait for that.
+COUNT_SECONDS = 0.005
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
 
@@ -99,9 +104,13 @@ class PolicyServer:
         self._limits = limits_for(options.max_message_mb, options.max_clients, limits)
         self._log = LimitedLog(logger)
         hosts = AllowedHosts(options.host, options.allowed_hosts)
+        # Why no request can be served any more: the device failed for good. None as long as it works.
+        self.lost: str | None = None
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
         self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
-        self._listener = Listener(self._gate, self._handle, Shared(self._limits, self.metrics, self._log))
+        in_place = calls is None and options.record_dir is None and getattr(policy, "reads_in_place", False)
+        shared = Shared(self._limits, self.metrics, self._log, in_place=in_place)
+        self._listener = Listener(self._gate, self._handle, shared)
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
         self._calls: Calls = (
@@ -116,7 +125,7 @@ class PolicyServer:
                 )
             size = policy.metadata.get("memory", {}).get("bytes")
             self._histories = Histories(policy.new_history, size)  # type: ignore[attr-defined]
-        self._lost: Future[str] = Future()  # set from the worker's thread
+        self._lost: Future[None] = Future()  # done when `lost` is there: from the worker's thread
         self._requests = RequestHandler(
             self._calls,
             self._real_time,
@@ -132,6 +141,7 @@ class PolicyServer:
         self._traces: Traces | None = None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
+        self._uncounted: list[Callable[[], None]] = []
         self._stopping = False
         self._greeting = b""
 
@@ -142,15 +152,11 @@ class PolicyServer:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"ws://{host}:{self.port}"
 
-    @property
-    def lost(self) -> str | None:
-        """Why no request can be served any more: the device failed for good. None as long as it works."""
-        return self._lost.result() if self._lost.done() else None
-
     def _lose(self, reason: str) -> None:
-        if not self._lost.done():
+        if self.lost is None:
             logger.error("the device is lost, and every request is refused from here on: %s", reason)
-            self._lost.set_result(reason)
+            self.lost = reason
+            self._lost.set_result(None)
 
     @property
     def recording(self) -> Path | None:
@@ -224,6 +230,7 @@ class PolicyServer:
         await self._calls.drain()
         await self._listener.ended(self._limits.close_seconds)
         await asyncio.gather(*goodbyes)
+        self._count()
         self._calls.close()
         if self._live is not None:
             await self._live.close()
@@ -295,6 +302,7 @@ class PolicyServer:
         """One client, from its metadata to its close; or one who watches."""
         if self._live is not None:
             if is_feed(connection.request):
+                self._count()  # all that was answered is there in the first frame
                 self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
             self._live.connected(connection)
@@ -319,6 +327,7 @@ class PolicyServer:
             logger.exception("%s: the server failed", peer(connection))
             await self._fail(connection, traceback.format_exc())
         finally:
+            self._count()
             self._idle.discard(connection)
             self._real_time.closed(connection)
             if self._histories is not None:
@@ -333,6 +342,7 @@ class PolicyServer:
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
+        self._count()  # in the order in which it happened
         self.metrics.error("policy")
         if self._live is not None:
             self._live.refused(connection, "policy", _raised(text))
@@ -357,46 +367,79 @@ class PolicyServer:
                 await self._refuse(connection, reply)
                 self._trace_refusal(connection, begun, reply, received)
                 continue
-            result, scheduling, notes = reply.result, reply.scheduling, reply.notes
             if reply.sent is None:
-                await connection.send(pack(result))
+                await connection.send(pack(reply.result))
                 finished = time.perf_counter()
-                await asyncio.sleep(0)  # the other clients of the batch get their answers before what follows
             else:
-                await connection.drain()
+                with contextlib.suppress(OSError):  # its client has left, which the next message says
+                    await connection.drain()
                 finished = reply.sent
-            self.metrics.request_seconds.observe(finished - received)
-            if self._traces is not None:
-                assert isinstance(begun, ClientRequest)
-                self._traces.answered(connection, begun, result, finished)
-            if scheduling.firm:
-                self.metrics.slack(received + scheduling.deadline - finished, scheduling.priority)
-            for note in notes:
-                self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
-                if self._live is not None:
-                    self._live.noted(connection, note.kind, note.text)
             connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
-            if "actions" not in result:  # a policy with memory has recorded the observation alone
-                connection.answered("good")
-                continue
-            if self._live is not None:
-                assert isinstance(message, bytes)
-                self._live.answered(connection, message, reply, finished - received)
-            if self._recorder is not None:
-                assert isinstance(message, bytes)
-                self._record(message, result, scheduling.batch)
-            del message, begun, reply, result  # a connection that waits must not hold them in memory
+            assert isinstance(begun, ClientRequest) and not isinstance(message, str)
+            self._count_later(connection, message, begun, reply, finished)
+            del message, begun, reply  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
 
-    async def _next(self, connection: GuardedConnection) -> tuple[str | bytes, float, Begun]:
+    def _count_later(
+        self,
+        connection: GuardedConnection,
+        message: bytes | memoryview,
+        request: ClientRequest,
+        reply: Reply,
+        finished: float,
+    ) -> None:
+        """Count an answer after COUNT_SECONDS, or now if its message takes much memory."""
+        if self._live is not None and self._live.watched:
+            message = bytes(message)  # now: what comes next may be written over it
+        self._uncounted.append(partial(self._count_answer, connection, message, request, reply, finished))
+        if len(message) > self._limits.free_bytes:
+            self._count()
+        elif len(self._uncounted) == 1:
+            asyncio.get_running_loop().call_later(COUNT_SECONDS, self._count)
+
+    def _count(self) -> None:
+        """Count all answers that aren't counted yet."""
+        uncounted, self._uncounted = self._uncounted, []
+        for count in uncounted:
+            try:
+                count()
+            except Exception:  # a fault of this server must cost no client
+                logger.exception("an answer wasn't counted, shown or recorded")
+
+    def _count_answer(
+        self,
+        connection: GuardedConnection,
+        message: bytes | memoryview,
+        request: ClientRequest,
+        reply: Reply,
+        finished: float,
+    ) -> None:
+        scheduling, seconds = reply.scheduling, finished - request.arrived
+        self.metrics.request_seconds.observe(seconds)
+        if self._traces is not None:
+            self._traces.answered(connection, request, reply.result, finished)
+        if scheduling.firm:
+            self.metrics.slack(scheduling.deadline - seconds, scheduling.priority)
+        for note in reply.notes:
+            self._log.warning(f"{peer(connection)}: {note.text}", note.kind)
+            if self._live is not None:
+                self._live.noted(connection, note.kind, note.text)
+        if "actions" not in reply.result:  # a policy with memory has recorded the observation alone
+            return
+        if self._live is not None:
+            self._live.answered(connection, message, reply, seconds)
+        if self._recorder is not None:
+            self._record(bytes(message), reply.result, scheduling.batch)
+
+    async def _next(self, connection: GuardedConnection) -> tuple[str | bytes | memoryview, float, Begun]:
         """The next message, when it came, and its request, which is submitted by the callback that receives it.
 
         Raises ClientLeft if the client leaves meanwhile.
         """
         begun: list[tuple[float, Begun | Exception]] = []
 
-        def begin(message: bytes) -> "asyncio.Future[Any] | None":
+        def begin(message: bytes | memoryview) -> "asyncio.Future[Any] | None":
             self._idle.discard(connection)
             received = time.perf_counter()
             try:
@@ -432,6 +475,7 @@ class PolicyServer:
         """Send the refusal; close with 1008 after many bad requests in a row: such a client doesn't read answers."""
         kind, text = refusal
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+        self._count()  # in the order in which it happened
         self.metrics.error(kind)
         self._log.warning(f"{peer(connection)}: {text}", kind)
         if self._live is not None:

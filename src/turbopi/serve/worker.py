@@ -164,6 +164,10 @@ class Worker:
             if results is None and request in self._waiting:
                 self.schedule.put_back(request)
         self._next()  # first: the policy shouldn't wait for what follows
+        for request, results in zip(turn, ran.results, strict=True):  # no client should wait for what others cause
+            if request.answer is not None and request in self._waiting and isinstance(results, list):
+                with contextlib.suppress(Exception):  # its task finds the same fault, and says so
+                    request.answer(*results)
         for request, results in zip(turn, ran.results, strict=True):
             if isinstance(results, Future):
                 self._answer_later(request, results)

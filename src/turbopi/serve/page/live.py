@@ -172,7 +172,9 @@ class Live:
             robot.lost, robot.how, robot.preview = time.time(), clean(how), None
             self._lost.append(robot)
 
-    def answered(self, connection: GuardedConnection, message: bytes, reply: Reply, seconds: float) -> None:
+    def answered(
+        self, connection: GuardedConnection, message: bytes | memoryview, reply: Reply, seconds: float
+    ) -> None:
         """`reply` was sent, `seconds` after `message` had come. They must not change any more."""
         robot, result, scheduling = self._known_by_name(connection), reply.result, reply.scheduling
         robot.calls += 1
@@ -194,10 +196,15 @@ class Live:
         now = asyncio.get_running_loop().time()
         if now - robot.previewed >= max(1 / FRAMES_A_SECOND, len(self._robots) / PREVIEWS_A_SECOND):
             robot.previewed, robot.pending = now, True
-            shown = message if len(message) <= MESSAGE_BYTES else None
+            shown = bytes(message) if len(message) <= MESSAGE_BYTES else None
             task = asyncio.ensure_future(self._make_preview(robot, shown, reply, timing))
             self._pending.add(task)
             task.add_done_callback(self._pending.discard)
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at the page."""
+        return bool(self._watchers)
 
     def noted(self, connection: GuardedConnection, kind: str, text: str) -> None:
         """The log has a note on a robot's call."""

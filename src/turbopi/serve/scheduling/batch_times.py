@@ -51,6 +51,7 @@ class BatchTimes:
 
     def __init__(self, largest: int = 1) -> None:
         self.largest = largest
+        self.measured_largest = 1  # the largest batch that may be formed at all
         self._warm: dict[int, _Times] = {}
         self._recent: dict[int, _Times] = {}
         # The size that failed, until when it isn't formed, and for how long after the next failure.
@@ -64,6 +65,7 @@ class BatchTimes:
     def measured(self, rows: int, seconds: float) -> None:
         """A run at warm-up."""
         self._warm.setdefault(rows, _Times()).add(seconds, 0.0)
+        self.measured_largest = self._measured_up_to(self.largest)
         self._clear()
 
     def ran(self, rows: int, seconds: float, now: float) -> None:
@@ -76,6 +78,7 @@ class BatchTimes:
     def limit(self, rows: int) -> None:
         """No batches of more, ever: warm-up couldn't measure them."""
         self.largest = min(self.largest, max(1, rows))
+        self.measured_largest = self._measured_up_to(self.largest)
         self._clear()
 
     def failed(self, rows: int, now: float) -> float:
@@ -94,11 +97,6 @@ class BatchTimes:
         if now < self._failed_until:
             return self._measured_up_to(min(self.largest, self._failed - 1))
         return self.measured_largest
-
-    @property
-    def measured_largest(self) -> int:
-        """The largest batch that may be formed at all; 1 if none was measured."""
-        return self._measured_up_to(self.largest)
 
     def _measured_up_to(self, most: int) -> int:
         return max((rows for rows in self._warm if rows <= most), default=1)

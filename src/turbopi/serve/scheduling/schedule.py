@@ -64,7 +64,7 @@ class Request:
     alone     never in a batch with others
     joins     it joins a chunk or requests model_actions: runs with such a request have a table T(B) of their own
     call      what to run; not read here
-    answer    sends its result at once, from the policy's thread; not read here
+    answer    sends its result at once, from any thread; not read here
     """
 
     arrived: float
@@ -128,6 +128,11 @@ class _Recent:
         self._last[source] = (now, value)
         self._last.move_to_end(source)
         self._drop(now)
+
+    def others(self, now: float, source: Hashable) -> bool:
+        """Whether any but this source did."""
+        self._drop(now)
+        return len(self._last) > (source in self._last)
 
     def values(self, now: float) -> dict[Hashable, float]:
         self._drop(now)
@@ -222,13 +227,14 @@ class Schedule:
         """
         if self._running or self._waiting or request.firm or request.continued:
             return False
-        if not request.alone and self._times((request,)).formed_largest(now) > request.rows:
-            own = {request.source}
-            if self._active.values(now).keys() - own or self._think_times.expected(now, ACTIVE_SECONDS, own):
+        times, turns = (self._joining,) * 2 if request.joins else (self.times, self._turns)
+        if not request.alone and times.formed_largest(now) > request.rows:
+            own = (request.source,)
+            if self._active.others(now, request.source) or self._think_times.expected(now, ACTIVE_SECONDS, own):
                 return False
         request.queued = now
         self._running, self._exhausted_last = (request,), False
-        self._until = now + self._turn_seconds((request,), now)
+        self._until = now + turns.total(request.rows, now)
         return True
 
     def remove(self, request: Request) -> None:
@@ -253,7 +259,9 @@ class Schedule:
         """
         if seconds is not None:
             rows = sum(request.rows for request in self._running)
-            self._turn_times(self._running).ran(rows, seconds, now)
+            times = self._turn_times(self._running)
+            times.ran(rows, seconds, now)
+            times.seconds(1, now)  # it is kept until the next request comes, which then needn't wait for it
         for request in self._running:
             if not request.later:
                 self._think_times.answered(request.source, now)

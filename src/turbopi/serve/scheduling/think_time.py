@@ -52,8 +52,7 @@ class ThinkTimes:
             self._answered.popitem(last=False)  # its requests are too rare to wait for
         found = []
         for source, answered in self._answered.items():
-            usual = self._usual(source)
-            if usual is not None and source not in but:
+            if source not in but and (usual := self._usual(source)) is not None:
                 last = answered + usual * GIVE_UP_FACTOR + GIVE_UP_SECONDS
                 if last > now:
                     found.append((answered + usual, last))
