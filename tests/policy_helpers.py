@@ -11,7 +11,7 @@ from turbopi.checkpoint import Checkpoint
 def policy_on(backend: Callable[..., Any], checkpoint: Checkpoint, **options: Any) -> UnifiedPolicy:
     """A policy in float32 on the CPU. `backend` makes its backend, as `Backend.__init__` does."""
 
-    def create(_: str, *arguments: Any, quantization: None, **more: Any) -> Any:
+    def create(_: str, *arguments: Any, quantization: None, writes: bool, **more: Any) -> Any:
         return backend(*arguments, **more)
 
     with mock.patch("turbopi.backends.create", create):
