@@ -1,29 +1,43 @@
 """Reports of studies below benchmarks/results/: their Markdown and plots, and the documents' tables of them."""
 
+import json
+import lzma
 from collections.abc import Iterator
 from pathlib import Path
 
 from doc_tables.drawn import compacted
 from turbopi.support.errors import ConfigError
-from turbopi.support.reading import read_document
+from turbopi.support.reading import as_document, read_document
 from turbopi_lab.studies import report
 from turbopi_lab.studies.report import Report, table_lines
 
 
 def read_report(file: Path) -> Report:
-    """Raises ConfigError, a ValueError, for a file of another kind."""
+    """Raises ConfigError, a ValueError, for a file of another kind. A large one may be packed (.xz)."""
+    if file.suffix == ".xz":
+        return as_document(json.loads(lzma.decompress(file.read_bytes())), Report, str(file))
     return read_document(file, Report, ConfigError)
 
 
 def _reports(root: Path) -> Iterator[tuple[Path, Report]]:
-    for file in sorted((root / "benchmarks" / "results").glob(f"*/*/{report.JSON}")):
-        yield file.parent, read_report(file)
+    for file in sorted((root / "benchmarks" / "results").glob(f"*/*/{report.JSON}*")):
+        yield file, read_report(file)
+
+
+def _written(file: Path, document: Report) -> Iterator[Path]:
+    for path in report.write(document, file.parent):
+        if path.name == report.JSON and file.suffix == ".xz":
+            file.write_bytes(lzma.compress(path.read_bytes(), preset=9 | lzma.PRESET_EXTREME))
+            path.unlink()
+        else:
+            yield path
 
 
 def stale_reports(root: Path) -> list[str]:
     """One line for each report whose Markdown isn't what its JSON says, or whose plots are missing."""
     found = []
-    for folder, document in _reports(root):
+    for file, document in _reports(root):
+        folder = file.parent
         text = folder / report.MARKDOWN
         if not text.is_file() or text.read_text(encoding="utf-8") != report.markdown(document):
             found.append(f"{text.relative_to(root)} isn't what {report.JSON} beside it says; run scripts/tables")
@@ -36,7 +50,7 @@ def write_reports(root: Path) -> list[Path]:
     """Write Markdown and plots of every report that needs them anew."""
     if not stale_reports(root):
         return []
-    return compacted(path for folder, document in _reports(root) for path in report.write(document, folder))
+    return compacted(path for file, document in _reports(root) for path in _written(file, document))
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
