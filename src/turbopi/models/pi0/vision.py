@@ -1,5 +1,7 @@
 """SigLIP So400m/14: images to tokens. 27 pre-LayerNorm blocks with biases everywhere; no CLS token, no pooling."""
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -11,6 +13,7 @@ from turbopi.models.pi0.layers import attention, merge_heads, split_heads
 class SelfAttention(nn.Module):
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
+        self.attend: Callable[[Tensor, Tensor, Tensor], Tensor] = attention  # a family may take another one
         self.head_dim = config.head_dim
         self.q_proj = nn.Linear(config.width, config.width)
         self.k_proj = nn.Linear(config.width, config.width)
@@ -19,7 +22,7 @@ class SelfAttention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = (split_heads(project(x), self.head_dim) for project in (self.q_proj, self.k_proj, self.v_proj))
-        return self.out_proj(merge_heads(attention(q, k, v)))
+        return self.out_proj(merge_heads(self.attend(q, k, v)))
 
 
 class MLP(nn.Module):

@@ -22,7 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from turbopi.config import VisionConfig
 from turbopi.models.observation import Observation
+from turbopi.models.pi0 import layers
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings
 from turbopi.models.pi0.denoise import time_embedding
 from turbopi.models.pi0.exact import exact_float32
@@ -118,6 +120,11 @@ class Layer(nn.Module):
 
 class Vision(VisionTower):
     """SigLIP for patch grids of any size: float32[N, h, w, 3] in [-1, 1] -> [N, patches, W], in the weights' dtype."""
+
+    def __init__(self, config: VisionConfig) -> None:
+        super().__init__(config)
+        for layer in self.layers:
+            layer.self_attn.attend = vision_attention  # type: ignore[union-attr]
 
     def forward(self, images: Tensor) -> Tensor:
         x = self.embed_patches(normalize_images(images).to(self.patch_embedding.weight.dtype))
@@ -447,6 +454,11 @@ def pixel_shuffle(x: Tensor, side: int, factor: int) -> Tensor:
     small = side // factor
     x = x.reshape(n, small, factor, small, factor, width).permute(0, 1, 3, 2, 4, 5)
     return x.reshape(n, small * small, factor * factor * width)
+
+
+def vision_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """On CPUs PyTorch's kernel, as in LeRobot: it knows no TF32, and 1,024 patches take a third less of the call."""
+    return F.scaled_dot_product_attention(q, k, v) if q.device.type == "cpu" else layers.attention(q, k, v)
 
 
 def attention(q_BHSK: Tensor, k_BGTK: Tensor, v_BGTK: Tensor, mask: Tensor) -> Tensor:
