@@ -376,24 +376,17 @@ class PolicyServer:
                 finished = reply.sent
             connection.cycle_s = finished - started  # with the wait for the request, as openpi counts it
             assert isinstance(begun, ClientRequest) and not isinstance(message, str)
-            self._count_later(connection, message, begun, reply, finished)
+            if self._live is not None and self._live.watched:
+                message = bytes(message)  # now: what comes next may be written over it
+            self._count_later(partial(self._count_answer, connection, message, begun, reply, finished), len(message))
             del message, begun, reply  # a connection that waits must not hold them in memory
             connection.answered("good")
         await self._say_goodbye(connection)
 
-    def _count_later(
-        self,
-        connection: GuardedConnection,
-        message: bytes | memoryview,
-        request: ClientRequest,
-        reply: Reply,
-        finished: float,
-    ) -> None:
-        """Count an answer after COUNT_SECONDS, or now if its message takes much memory."""
-        if self._live is not None and self._live.watched:
-            message = bytes(message)  # now: what comes next may be written over it
-        self._uncounted.append(partial(self._count_answer, connection, message, request, reply, finished))
-        if len(message) > self._limits.free_bytes:
+    def _count_later(self, count: Callable[[], None], size: int) -> None:
+        """Count an answer after COUNT_SECONDS, or now if its message of so many bytes takes much memory."""
+        self._uncounted.append(count)
+        if size > self._limits.free_bytes:
             self._count()
         elif len(self._uncounted) == 1:
             asyncio.get_running_loop().call_later(COUNT_SECONDS, self._count)
