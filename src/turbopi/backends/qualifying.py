@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 SECONDS, PATIENT_SECONDS = 60.0, 600.0  # at most: when a policy is made; ahead
 ATTEMPTS: Final = 4  # processes at most: one that died may be followed by one without what it died of
 TURNS: Final = 2  # starts whose time is up until `auto` leaves it to `doctor`: the second one finds compiled kernels
-STAGES: Final = ("grid barrier", "kernels", "the model's sizes", "race", "the shipped policy")
+STAGES: Final = ("grid barrier", "kernels", "the model's sizes", "the shipped policy", "race")
 DOUBLE_VARIABLE: Final = "TURBOPI_QUALIFY_DOUBLE"  # a module that the process imports first: planted faults
 Tell = Callable[[str, int], None]  # what is done now, and how many of STAGES are
 

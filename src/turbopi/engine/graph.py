@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from turbopi.kernels.ahead import compiling_ahead
 from turbopi.kernels.nvrtc import capturing
 from turbopi.models.pi0.exact import exact_float32
 
@@ -105,8 +106,9 @@ class Graph:
         with building(stream.device):
             stream.wait_stream(torch.cuda.current_stream(stream.device))
             with torch.cuda.stream(stream):
-                for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
+                with compiling_ahead():
                     run(lambda stage: None)
+                run(lambda stage: None)  # allocates whatever the kernels need, outside the capture
             stream.synchronize()
             self._capture(run, pool, stream)
 

@@ -1,14 +1,13 @@
-"""What is done beside the stages, in a second process: the shipped policy's certificate, and the rival, made and warm.
+"""What is done beside the stages, in a second process: the rival, made and warm.
 
-Compilers take most of the time, on one core of many. What the second process can't do, for whatever reason, the first
-one does itself when it comes to it, and finds the reason.
+Compiling it takes as long as all stages before the race. Where the second process can't, for whatever reason, the first
+one makes the rival when it comes to it, and finds the reason.
 """
 
-import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import IO, Final
@@ -20,8 +19,6 @@ from msgspec import Struct
 from turbopi.backends.qualifying import Request
 from turbopi.qualify.stages import Figures, Subject, Turn, rival_turn
 
-logger = logging.getLogger(__name__)
-
 ARGUMENT: Final = "--ahead"  # of `python -m turbopi.qualify`
 PATIENCE = 30.0  # seconds at most that the first process waits for the second
 
@@ -31,15 +28,8 @@ def _command() -> list[str]:
 
 
 class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A line of what the second process says, in this order.
+    """A line of what the second process says: first that the rival is warm, then a turn for each line that it reads."""
 
-    certified  the shipped policy's figures; none without such a policy
-    rival      whether it is warm
-    turn       each stage's time, for each line that it reads
-    """
-
-    certified: Figures | None = None
-    rival: bool = False
     turn: Figures | None = None
 
 
@@ -47,30 +37,16 @@ class Ahead:
     """The second process, as the first one sees it. It ends when its input does."""
 
     def __init__(self, request: Request) -> None:
-        self._excluded = dict(request.excluded)
         self._answers: SimpleQueue[bytes | None] = SimpleQueue()
-        self._certified: Answer | None = None
-        self._warm: bool | None = None
+        self._warm = False
         pipe = subprocess.PIPE
         self._process: subprocess.Popen[bytes] | None = subprocess.Popen(_command(), stdin=pipe, stdout=pipe)
         threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True).start()
         self._write(msgspec.json.encode(request))
 
-    def certified(self, excluded: Iterable[str]) -> Figures | None:
-        """The shipped policy's figures, with the same paths excluded; None: it has to be certified here."""
-        if set(excluded) != set(self._excluded):
-            return None
-        if self._certified is None:
-            self._certified = self._next()
-        return None if self._certified is None else self._certified.certified
-
     def rival(self) -> Turn | None:
         """What measures a turn of the rival; None: it has to be made here."""
-        if self._certified is None:
-            self._certified = self._next()
-        if self._warm is None:
-            answer = self._next()
-            self._warm = answer is not None and answer.rival
+        self._warm = self._warm or self._next() is not None
         return self._turn if self._warm and self._process is not None else None
 
     def stop(self) -> bool:
@@ -116,19 +92,12 @@ class Ahead:
         self._answers.put(None)
 
 
-def work(
-    subject: Subject, certified: Callable[[], Figures], say: Callable[[Answer], None], requests: IO[bytes]
-) -> None:
+def work(subject: Subject, say: Callable[[Answer], None], requests: IO[bytes]) -> None:
     """What the second process does, until nobody wants more."""
-    try:
-        say(Answer(certified=certified()))
-    except Exception:  # the first one finds out, and says it
-        logger.exception("the shipped policy is left to the other process")
-        say(Answer())
     if subject.rival is None:
         return
     turn = rival_turn(subject)
     turn()
-    say(Answer(rival=True))
+    say(Answer())
     for _ in requests:
         say(Answer(turn=turn()))

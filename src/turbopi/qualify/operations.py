@@ -14,6 +14,7 @@ from torch import Tensor
 
 from turbopi.backends.device_lost import Guard
 from turbopi.backends.qualification import DENOISE
+from turbopi.kernels.ahead import noting
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import BESIDE
 from turbopi.kernels.plain import PLAIN
@@ -22,6 +23,7 @@ from turbopi.tune.race import first_line, wrong
 # Of two results' difference, relative rms. Each rounds to bfloat16 once or twice, which is 0.0011 a time; E4M3 to 0.026
 BOUND, EIGHT_BITS_BOUND = 0.01, 0.06
 TABLE_BYTES = 256 << 20  # from here on a tensor is the table of embeddings, which nothing writes to
+AHEAD = "compiling side by side"  # among what is excluded
 COMPILING, RUNNING = (
     300.0,
     10.0,
@@ -30,10 +32,13 @@ At = Callable[[str, str, float], None]  # what begins, what to exclude if it fai
 
 
 class Comparison:
-    """errors: the worst of each operation that was compared; failed: why one isn't right; compares: whether it does."""
+    """errors: the worst of each operation that was compared; failed: why one isn't right; compares: whether it does.
 
-    def __init__(self, device: torch.device, at: At) -> None:
-        self.compares = True
+    ahead: whether kernels may be compiled side by side. Where that ends the process, the next one finds out by which.
+    """
+
+    def __init__(self, device: torch.device, at: At, ahead: bool = True) -> None:
+        self.compares, self._ahead = True, ahead
         self.errors: dict[str, float] = {}
         self.failed: dict[str, str] = {}
         self._at, self._device, self._guard = at, device, Guard(device)
@@ -69,6 +74,11 @@ class Comparison:
     def _both(self, name: str, ours: Callable[..., Any], plain: Callable[..., Any], *given: Any, **named: Any) -> Any:
         if name in self.failed:
             return plain(*given, **named)
+        if noting():
+            if not self._ahead:
+                return plain(*given, **named)
+            self._at("compiling kernels", AHEAD, COMPILING)
+            return ours(*given, **named)
         if not self.compares or capturing():
             return ours(*given, **named)
         if name not in self.errors:

@@ -49,12 +49,6 @@ def run(subject: Subject, say: Say, beside: Ahead | None = None) -> bool:
     return False
 
 
-def certify_shipped(subject: Subject) -> Figures:
-    """None of them where no policy ships that the backend runs as it runs the model."""
-    policy = golden(subject)
-    return {} if policy is None else certify(subject, policy, subject.quantization(policy))
-
-
 def run_stages(subject: Subject, say: Say, beside: Ahead | None) -> None:
     """Raises Faulty for what isn't right and has no other path beside it."""
     qualification.under_test = subject.excluded  # which the backends of this process look at
@@ -93,6 +87,9 @@ def run_stages(subject: Subject, say: Say, beside: Ahead | None) -> None:
     stage(STAGES[1], kernels, lambda errors: f"{len(errors)} operations equal PyTorch's")
     stage(STAGES[2], lambda: certify(subject, small, calibration), _worst)
 
+    if (policy := golden(subject)) is not None:
+        stage(STAGES[3], lambda: certify(subject, policy, subject.quantization(policy)), _worst)
+
     def timed() -> Figures:
         raced = race(subject, calibration, beside.rival if beside is not None else lambda: None)
         figures = {f"{name} ms": times["total"] for name, times in raced.milliseconds.items()}
@@ -101,17 +98,7 @@ def run_stages(subject: Subject, say: Say, beside: Ahead | None) -> None:
         say(Event(milliseconds=raced.milliseconds, memory=raced.memory, taken=taken, reason=reason))
         return figures
 
-    stage(STAGES[3], timed, _times)
-    raced_without = set(subject.excluded)
-
-    def shipped() -> Figures:
-        found = None if beside is None else beside.certified(subject.excluded)
-        return certify_shipped(subject) if found is None else found
-
-    if golden(subject) is not None:
-        stage(STAGES[4], shipped, _worst)
-    if raced_without != set(subject.excluded):
-        timed()
+    stage(STAGES[4], timed, _times)
     say(Event(done=True))
 
 

@@ -26,7 +26,7 @@ from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy import shipped
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
-from turbopi.qualify.operations import COMPILING, At, Comparison
+from turbopi.qualify.operations import AHEAD, COMPILING, At, Comparison
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, shapes_of
 from turbopi.quantization.plan import TIERS, Precision, format_of
 from turbopi.quantization.sites import Site, sites
@@ -159,7 +159,8 @@ def check_grid(subject: Subject) -> Figures:
 
 def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quantization | None) -> Comparison:
     """Every operation of a call beside PyTorch's, then a batch beside its single calls."""
-    cls, compared = backends.class_for(subject.name, subject.model), Comparison(subject.device, subject.at)
+    cls = backends.class_for(subject.name, subject.model)
+    compared = Comparison(subject.device, subject.at, ahead=AHEAD not in subject.excluded)
 
     class Compared(cls):  # type: ignore[valid-type, misc]
         def _make_ops(self) -> Any:

@@ -9,11 +9,11 @@ kernels/portable/{attention,batch}.py.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from torch import Tensor
 
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.interface import Segments
@@ -223,7 +223,7 @@ def source(tile: AttentionTile) -> str:
     return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
 
 
-@cache
+@MadeOnce
 def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, packed: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole, packed))

@@ -4,11 +4,10 @@ Twin: `kernels.plain_batch.suffix_attention`. The kernel for all other GPUs, and
 kernels/portable/batch.py.
 """
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
@@ -129,7 +128,7 @@ def _kernel(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel:
     return made
 
 
-@cache
+@MadeOnce
 def _kernel_or_why_not(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel | BackendUnavailable:
     """`chosen_tile` asks again for each layer: where no cluster of a size fits, it is loaded once to find that out."""
     with torch.cuda.device(device):

@@ -5,12 +5,12 @@ are added up, which the norms in `norms.py` do.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.sm90 import instructions
@@ -354,7 +354,7 @@ def leaves_in_lines(tile: Tile, epilogue: Epilogue) -> bool:
     return epilogue == "parts" or (epilogue == "added" and not tile.overlap)
 
 
-@cache
+@MadeOnce
 def _kernel(
     tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, device: torch.device
 ) -> DependentKernel:

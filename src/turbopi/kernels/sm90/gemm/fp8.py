@@ -10,6 +10,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.sm90.gemm.bf16 import (
     SPLIT,
     Copy,
@@ -148,7 +149,7 @@ def constants(
     return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=promote > 0) | own
 
 
-@cache
+@MadeOnce
 def _kernel(
     tile: Tile,
     epilogue: Epilogue,

@@ -3,12 +3,12 @@
 Twin: `residual_layer_norm` of `kernels.plain`.
 """
 
-from functools import cache
 from typing import Any, Final
 
 import torch
 from torch import Tensor
 
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable import norms
@@ -73,7 +73,7 @@ def source(in_fp8: bool) -> str:
     return instructions.source("norms/layer_norm.cu", generated=generated)
 
 
-@cache
+@MadeOnce
 def _kernel(width: int, has_y: bool, in_fp8: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(in_fp8), "sm_90a", constants(width, has_y, in_fp8))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import GemmaConfig
+from turbopi.kernels.ahead import MadeOnce
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.interface import BackwardOps
 from turbopi.kernels.nvrtc import compile_cubin
@@ -89,7 +90,7 @@ def compiled(one: Cut, mode: Mode, folder: Path | None = None) -> bytes:
     return compile_cubin(source(), "sm_90a", one.sizes(mode), folder=folder)
 
 
-@cache
+@MadeOnce
 def _kernel(one: Cut, mode: Mode, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compiled(one, mode)
