@@ -1,7 +1,7 @@
 """The engine's step of a model that writes tokens equals the reference's, in its own buffers."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -17,6 +17,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.engine import token
 from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0_fast.reference import Pi0FastModel, compacted
+from turbopi.quantization.fp8 import ScaledMatrix
 
 pytestmark = gpu_or_interpreter()
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -58,6 +59,27 @@ def test_a_token_is_the_references(policy: UnifiedPolicy, name: str) -> None:
     for field in ("keys", "values"):
         for one, other in zip(getattr(ours, field), getattr(theirs, field), strict=True):
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_int8_weights_are_what_is_multiplied(policy: UnifiedPolicy, name: str) -> None:
+    model = policy.backend.model  # type: ignore[attr-defined]
+    rounded, wide = token.JoinedWeights(model, int8=True), token.JoinedWeights(model)
+    assert isinstance(rounded.head, ScaledMatrix) and rounded.head.numbers == torch.int8
+    wide.head, wide.layers = rounded.head.dequantized(), [meant(one) for one in rounded.layers]
+    ours, expected, exact = (begun(policy, name, model, 1) for _ in range(3))
+    token.TokenStep(model, rounded, ours)()
+    token.TokenStep(model, wide, expected)()
+    model.step(exact)
+    assert (ours.logits - expected.logits).abs().max() <= 2e-5 * expected.logits.abs().max()
+    error = (ours.logits - exact.logits).norm() / exact.logits.norm()
+    assert 1e-4 < error < 0.03, "a row's 255 steps are 0.008 of a normal variable's rms"
+
+
+def meant(layer: token.LayerWeights) -> token.LayerWeights:
+    """The numbers that INT8 stands for."""
+    matrices = (getattr(layer, one.name) for one in fields(layer))
+    return token.LayerWeights(*(one.dequantized() for one in matrices if isinstance(one, ScaledMatrix)))
 
 
 @pytest.mark.parametrize("name", ["quantiles_empty_camera"], indirect=True)

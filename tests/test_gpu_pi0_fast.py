@@ -9,6 +9,7 @@ from smolvla_golden import relative
 
 from turbopi import UnifiedPolicy
 from turbopi.models.observation import Observation
+from turbopi.support.errors import ConfigError
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("default")]  # Inductor warns of what it does
 
@@ -66,3 +67,19 @@ def test_bfloat16_is_as_near_to_float32_as_ordinary_bfloat16(name: str, captured
         for policy in (*both, captured)
     )
     assert 0 < relative(graphs, exact) <= 1.5 * relative(ordinary, exact)
+
+
+def test_int8_weights_are_refused_by_name_or_near_float32(name: str, captured: UnifiedPolicy, folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("HF_HUB_CACHE", str(folder.parent / "hub"))
+        rounded = policy_of(folder, device="cuda", precision="int8-weights", backend="auto")
+        with pytest.raises(ConfigError, match="runs in bf16 or f32, not in 'int8-weights'"):
+            policy_of(folder, device="cuda", precision="int8-weights", backend="pytorch")
+    assert rounded.metadata["backend_details"]["tokens_by"] == "engine, weights in INT8"
+    prepared = Observation.stack([rounded.prepare(runs(name).observation(0))])
+    noise = torch.randn(1, 8, 7, generator=torch.Generator().manual_seed(0))
+    ours, exact = (
+        policy.backend.intermediates(prepared, noise, 80)["logits"].float().cpu().numpy()
+        for policy in (rounded, captured)
+    )
+    assert 0 < relative(ours, exact) <= 0.05

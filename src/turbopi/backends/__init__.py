@@ -9,6 +9,7 @@ import importlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import torch
 
@@ -40,7 +41,7 @@ __all__ = [
 ]
 
 logger = logging.getLogger(__name__)
-PRECISIONS: tuple[Precision, ...] = ("bf16", "f32", *TIERS)
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 @dataclass(frozen=True)
@@ -291,8 +292,8 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     checked_precision(precision)
     cls = class_of(name)
-    if precision not in cls.precisions:
-        raise ConfigError(f"backend {name!r} runs in {' or '.join(cls.precisions)}, not in {precision!r}")
+    if precision not in (own := precisions(name)):
+        raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}")
     reason, what = _unavailable(cls, device), "run"
     if precision in TIERS:
         if reason is not None and device.type != "cuda":
@@ -334,8 +335,11 @@ def create(
 
 
 def precisions(name: str) -> tuple[Precision, ...]:
-    """The precisions a backend runs in."""
-    return class_of(name).precisions
+    """The precisions a backend runs in, whatever the model."""
+    own, spec = class_of(name).precisions, BACKENDS.get(name)
+    if spec is None or spec.tokens is None:
+        return own
+    return tuple(dict.fromkeys((*own, *_loaded(spec.tokens).precisions)))
 
 
 def class_of(name: str) -> type[Backend]:
@@ -364,8 +368,12 @@ def class_for(name: str, config: Network, *, writes: bool = False) -> type[Backe
         place = spec.text
     if place is None:
         return cls
-    module, _, other = place.partition(":")
-    found: type[Backend] = getattr(importlib.import_module(module), other)
+    return _loaded(place)
+
+
+def _loaded(place: str) -> type[Backend]:
+    module, _, name = place.partition(":")
+    found: type[Backend] = getattr(importlib.import_module(module), name)
     return found
 
 

@@ -12,6 +12,7 @@ from turbopi.models.pi0.conditioning import Conditionings, Form, has_two_prompts
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.reference import Pi0Model, Trace
 from turbopi.models.pi0.text import TextWriter
+from turbopi.quantization.plan import WEIGHTS_ALONE
 from turbopi.support.errors import BackendError
 
 
@@ -31,7 +32,8 @@ class PyTorchBackend(Backend):
     model: Any  # of the family
 
     def load_weights(self, load: LoadState) -> None:
-        precision: FloatPrecision = "bf16" if self.precision == "bf16" else "f32"  # what is emulated is float32
+        exact = self.precision not in ("bf16", WEIGHTS_ALONE)  # what is emulated is float32, too
+        precision: FloatPrecision = "f32" if exact else "bf16"
         model_class = self.model_class or family_of(self.config).reference
         self.model = model_class.from_state(self.config, load(self.device, precision))
 

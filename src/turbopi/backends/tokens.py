@@ -18,6 +18,7 @@ from torch import Tensor
 from turbopi.backends.base import Backend, LoadState, Sample, StageTimer, Trace
 from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.pytorch import PyTorchBackend
+from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.resize import Resizer
 from turbopi.models import family_of
@@ -28,7 +29,8 @@ from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0_fast.reference import compacted
 from turbopi.preprocess.pipeline import of_row
-from turbopi.support.errors import ActionError, ObservationError
+from turbopi.quantization.plan import WEIGHTS_ALONE, Precision
+from turbopi.support.errors import ActionError, BackendUnavailable, ObservationError
 
 if TYPE_CHECKING:
     from turbopi.engine.token import JoinedWeights
@@ -159,22 +161,28 @@ class _Graphs:
 
 class CapturedTokensBackend(_Tokens, CapturedBackend):
     """The reference in CUDA graphs: vision and prefix through torch.compile where there is a compiler, and a token by
-    the engine (engine/token.py) where its sizes are for that.
+    the engine (engine/token.py) where its sizes are for that. The engine alone has INT8 weights.
     """
 
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32", WEIGHTS_ALONE)
     _graphs: dict[int, _Graphs]  # type: ignore[assignment]
 
     def load_weights(self, load: LoadState) -> None:
-        super().load_weights(load)
         self._joined: JoinedWeights | None = None
-        if self._compiles:  # Triton's kernels need a compiler, too
+        int8, why = self.precision == WEIGHTS_ALONE, PyTorchCompileBackend.unavailable(self.device)
+        if why is None:  # Triton's kernels need a compiler, too
             from turbopi.engine import token
 
-            if token.refuses(self.config) is None:
-                self._joined = token.JoinedWeights(self.model)
+            why = token.refuses(self.config)
+        if int8 and why is not None:
+            raise BackendUnavailable(f"INT8 weights are read by the engine's kernels alone: {why}; take 'bf16'")
+        super().load_weights(load)
+        if why is None:
+            self._joined = token.JoinedWeights(self.model, int8=int8)
 
     def describe(self) -> dict[str, Any]:
-        return super().describe() | {"tokens_by": "reference" if self._joined is None else "engine"}
+        by = "reference" if self._joined is None else "engine"
+        return super().describe() | {"tokens_by": f"{by}, weights in INT8" if self.precision == WEIGHTS_ALONE else by}
 
     @property
     def _to_compile(self) -> tuple[Callable[..., Any], ...]:

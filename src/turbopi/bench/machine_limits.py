@@ -11,6 +11,7 @@ from turbopi.kernels.grid_barrier import barrier_us
 _DTYPES = {
     "bf16": torch.bfloat16,
     "f32": torch.float32,
+    "int8-weights": torch.bfloat16,
     "fp8": torch.float8_e4m3fn,
     "fp8-mlp": torch.float8_e4m3fn,
     "int8": torch.int8,

@@ -30,7 +30,7 @@ from turbopi.checkpoint import Checkpoint
 from turbopi.config import Solver, TimeGrid
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.policy.policy import UnifiedPolicy
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import TIERS, WEIGHTS_ALONE
 from turbopi.robots import Robot
 from turbopi.support.errors import ConfigError, TurboPiError
 from turbopi.support.provenance import Gpu, provenance
@@ -304,7 +304,10 @@ def stage_floors(policy: UnifiedPolicy, job: Job, floors: Floors) -> dict[str, f
 
 
 def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Work]:
-    return stage_work(policy.config.model, job, {"f32": 4, "bf16": 2}.get(policy.backend.precision, 1))
+    model, precision = policy.config.model, policy.backend.precision
+    if precision == WEIGHTS_ALONE:  # of what is written behind the prefix
+        return {**stage_work(model, job, 2), "denoise": stage_work(model, job, 1)["denoise"]}
+    return stage_work(model, job, {"f32": 4, "bf16": 2}.get(precision, 1))
 
 
 def _policy(

@@ -11,7 +11,10 @@ from turbopi.support.errors import BackendUnavailable
 
 DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
 PrecisionOption = Annotated[
-    str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
+    str,
+    typer.Option(
+        "--precision", metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8", help="Say what auto takes in this one."
+    ),
 ]
 
 

@@ -159,7 +159,7 @@ def bench(
     precisions: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME,NAME,…", help="bf16, f32, fp8, fp8-mlp, int8; else bf16, or what the backends have instead."
+            metavar="NAME,NAME,…", help="As for `turbopi serve`; else bf16, or what the backends have instead."
         ),
     ] = None,
     table: Annotated[

@@ -118,7 +118,7 @@ def what_runs(index: int, capability: tuple[int, int], memory_gb: float) -> Iter
 
     yield from judge_compilers(index, capability)
     device = torch.device("cuda", index)
-    tiers = [precision for precision in backends.PRECISIONS if precision != "f32" and not precision.endswith("-mlp")]
+    tiers = ("bf16", "fp8", "int8")
     fitting: dict[str, float] = {
         tier: need for tier in tiers if (need := needed_gb(device, tier)) is not None and need <= memory_gb
     }

@@ -217,8 +217,9 @@ class PolicyOptions(RobotOptions):
         _option(
             "--precision",
             panel=_RUNNING,
-            metavar="bf16|f32|fp8|fp8-mlp|int8",
-            help="bf16 as openpi serves it, f32, or calibrated. Unless given, bf16, or what --backend has instead.",
+            metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8",
+            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, bf16, "
+            "or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[

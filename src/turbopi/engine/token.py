@@ -3,14 +3,21 @@
 It computes `Writer.step` in the same buffers, with fewer roundings.
 """
 
+from dataclasses import dataclass, replace
+
 import torch
 import triton
 from torch import Tensor, nn
 
 from turbopi.config import ModelConfig, Pi0FastConfig
 from turbopi.kernels.portable import token as kernels
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.models.pi0.decoding import Decoding, Writer
 from turbopi.models.pi0.layers import rope_tables
+from turbopi.quantization.formats import INT8
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix
+
+ROWS = 1 << 14  # of a matrix that are rounded at a time, for which float32 has to have room
 
 
 def refuses(config: Pi0FastConfig | ModelConfig) -> str | None:
@@ -25,18 +32,43 @@ def refuses(config: Pi0FastConfig | ModelConfig) -> str | None:
     return None
 
 
+@dataclass(frozen=True)
+class LayerWeights:
+    """[out, in] each; `qkv`: the queries', keys' and values' rows."""
+
+    qkv: Matrix
+    out: Matrix
+    gate: Matrix
+    up: Matrix
+    down: Matrix
+
+
 class JoinedWeights:
-    """Each layer's projections to queries, keys and values in one matrix, of which the model's own become views."""
+    """The matrices of a token. Each layer's projections to queries, keys and values are one matrix, of which the
+    model's own become views.
+
+    int8    beside the model's own, which read the prefix, in INT8: symmetric, with a scale for each row. Activations
+            stay float32, so nothing has to be calibrated
+    """
 
     @torch.no_grad()
-    def __init__(self, model: Writer) -> None:
-        self.of_layers: list[Tensor] = []
+    def __init__(self, model: Writer, *, int8: bool = False) -> None:
+        self.layers: list[LayerWeights] = []
         for layer in model.vlm.layers:
             own = [getattr(layer.self_attn, f"{name}_proj") for name in "qkv"]
             joined = torch.cat([one.weight for one in own])
             for one, part in zip(own, torch.split(joined, [len(one.weight) for one in own]), strict=True):
                 one.weight = nn.Parameter(part, requires_grad=False)
-            self.of_layers.append(joined)
+            mlp = layer.mlp
+            others = (layer.self_attn.o_proj, mlp.gate_proj, mlp.up_proj, mlp.down_proj)
+            matrices = [joined, *(one.weight.detach() for one in others)]
+            self.layers.append(LayerWeights(*(_rounded(one) if int8 else one for one in matrices)))
+        self.head: Matrix = _rounded(model.head) if int8 else model.head
+
+
+def _rounded(weight: Tensor) -> ScaledMatrix:
+    parts = [quantize(rows, 1.0, format=INT8) for rows in torch.split(weight.detach(), ROWS)]
+    return replace(parts[0], data=torch.cat([one.data for one in parts]), scale=torch.cat([one.scale for one in parts]))
 
 
 class TokenStep:
@@ -64,17 +96,16 @@ class TokenStep:
     def __call__(self) -> None:
         of, vlm, row, eps = self._decoding, self._model.vlm, self._row, self._model.config.rms_norm_eps
         kernels.embed_id(of.chosen, vlm.embed_tokens.weight, row)
-        for layer, qkv, keys, values in zip(vlm.layers, self._joined.of_layers, of.keys, of.values, strict=True):
-            kernels.row_product(row, qkv, self._qkv, norm=layer.input_layernorm, eps=eps)
+        for layer, own, keys, values in zip(vlm.layers, self._joined.layers, of.keys, of.values, strict=True):
+            kernels.row_product(row, own.qkv, self._qkv, norm=layer.input_layernorm, eps=eps)
             places = keys, values, self._valid, of.place, of.position
             kernels.attend_places(self._qkv, self._rope, *places, self._shares)
             kernels.join_shares(self._shares, self._attended)
-            kernels.row_product(self._attended, layer.self_attn.o_proj.weight, row, add=True)
-            norm, gated = layer.post_attention_layernorm, layer.mlp
-            up = gated.up_proj.weight
-            kernels.row_product(row, gated.gate_proj.weight, self._hidden, norm=norm, eps=eps, beside=up)
-            kernels.row_product(self._hidden, gated.down_proj.weight, row, add=True)
-        kernels.row_product(row, self._model.head, of.logits, norm=vlm.norm, eps=eps)
+            kernels.row_product(self._attended, own.out, row, add=True)
+            norm = layer.post_attention_layernorm
+            kernels.row_product(row, own.gate, self._hidden, norm=norm, eps=eps, beside=own.up)
+            kernels.row_product(self._hidden, own.down, row, add=True)
+        kernels.row_product(row, self._joined.head, of.logits, norm=vlm.norm, eps=eps)
         for first, behind in self._model.never:
             of.logits[:, first:behind] = -torch.inf
         counters = of.chosen, of.ids, of.count, of.place, of.position

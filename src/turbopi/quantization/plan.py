@@ -2,18 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from turbopi.quantization.formats import FORMATS, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, Site
 
-# that a policy runs in; the tiers need a calibration
-Precision = Literal["bf16", "f32", "fp8", "fp8-mlp", "int8"]
+# that a policy runs in; the tiers need a calibration, and weights in INT8 beside activations that aren't rounded none
+Precision = Literal["bf16", "f32", "int8-weights", "fp8", "fp8-mlp", "int8"]
 Fp8Tier = Literal["fp8", "fp8-mlp"]
 FP8_TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
 Tier = Literal["fp8", "fp8-mlp", "int8"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
+WEIGHTS_ALONE: Final = "int8-weights"
+EIGHT_BITS: tuple[Precision, ...] = (WEIGHTS_ALONE, *TIERS)
 
 
 def format_of(tier: str) -> Format:

@@ -17,9 +17,10 @@ since every way of adding up differs, and bugs are as much further off.
 """
 
 from turbopi.backends import Precision
+from turbopi.quantization.plan import EIGHT_BITS
 
 # times the control (control.py), for actions in the model's units
-BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0, "int8": 5.0}
+BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, **dict.fromkeys(EIGHT_BITS, 5.0)}
 TRAINED_FACTORS: dict[Precision, float] = BOUND_FACTORS | {"bf16": 10.0}
 
 # of `turbopi verify`

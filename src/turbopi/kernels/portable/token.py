@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.rope import rotated
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix
 
 PLACES = 32  # of keys and values, a program's
 LOGITS = 2048  # among which a program finds the best
@@ -25,11 +26,12 @@ _pow2 = triton.next_power_of_2
 
 @triton.jit
 def _row_product_kernel(
-    row, norm, weight, beside, out, rows, width, eps,
-    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr,
+    row, norm, weight, beside, scales, beside_scales, out, rows, width, eps,
+    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr, SCALED: tl.constexpr,
     ROWS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """out [rows] = weight [rows, width] · row [width]; GATED: gelu(that) times `beside` · row; ADD: `out` plus that.
+    SCALED: a weight's rows are numbers times their scales.
 
     NORM: the row is first divided by its rms and scaled; it needs BLOCK >= width, and so does GATED.
     """
@@ -40,6 +42,10 @@ def _row_product_kernel(
     part = tl.load(weight + at, there, 0.0)
     if GATED:
         other = tl.load(beside + at, there, 0.0)
+    if SCALED:
+        factor = tl.load(scales + n, n < rows, 0.0)
+        if GATED:
+            other_factor = tl.load(beside_scales + n, n < rows, 0.0)
     if NORM:
         scale = tl.load(norm + k, k < width, 0.0).to(tl.float32)
     wait_for_producer(PDL)
@@ -49,13 +55,18 @@ def _row_product_kernel(
         x *= tl.rsqrt(tl.sum(x * x, 0) / width + eps) * (1 + scale)
     total = tl.sum(part.to(tl.float32) * x[None, :], 1)
     if GATED:
-        total = gelu_tanh(total) * tl.sum(other.to(tl.float32) * x[None, :], 1)
+        up = tl.sum(other.to(tl.float32) * x[None, :], 1)
+        if SCALED:
+            total, up = total * factor, up * other_factor
+        total = gelu_tanh(total) * up
     else:
         for start in range(BLOCK, width, BLOCK):
             there = (n < rows)[:, None] & (k + start < width)[None, :]
             part = tl.load(weight + at + start, there, 0.0)
             x = tl.load(row + k + start, k + start < width, 0.0)
             total += tl.sum(part.to(tl.float32) * x[None, :], 1)
+        if SCALED:
+            total *= factor
     if ADD:
         total += tl.load(out + n, n < rows, 0.0)
     tl.store(out + n, total, n < rows)
@@ -177,19 +188,23 @@ def _embed_id_kernel(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL:
 
 
 def row_product(
-    row: Tensor, weight: Tensor, out: Tensor, *, norm: nn.Module | None = None, eps: float = 0.0,
-    beside: Tensor | None = None, add: bool = False,
+    row: Tensor, weight: Matrix, out: Tensor, *, norm: nn.Module | None = None, eps: float = 0.0,
+    beside: Matrix | None = None, add: bool = False,
 ) -> None:  # fmt: skip
     """weight [N, D] times row float32[D] -> out float32[N]; `norm`'s weight: of the RMSNorm that comes first.
 
-    beside  [N, D]: out is gelu(weight · row) times (beside · row)
+    beside  [N, D], in the weight's numbers: out is gelu(weight · row) times (beside · row)
     add     to what `out` holds
     """
     rows, width = weight.shape
     whole, other = _pow2(width), weight if beside is None else beside
+    numbers, scales = (weight.data, weight.scale) if isinstance(weight, ScaledMatrix) else (weight, row)
+    other_numbers, other_scales = (other.data, other.scale) if isinstance(other, ScaledMatrix) else (other, row)
+    assert numbers.dtype == other_numbers.dtype, (numbers.dtype, other_numbers.dtype)
     _row_product_kernel[(triton.cdiv(rows, ROWS),)](
-        row, row if norm is None else norm.get_parameter("weight"), weight, other, out, rows, width, eps,
-        NORM=norm is not None, GATED=beside is not None, ADD=add,
+        row, row if norm is None else norm.get_parameter("weight"), numbers, other_numbers, scales, other_scales, out,
+        rows, width, eps,
+        NORM=norm is not None, GATED=beside is not None, ADD=add, SCALED=isinstance(weight, ScaledMatrix),
         ROWS=ROWS, BLOCK=whole if norm is not None else min(BLOCK, whole), num_warps=4, **dependent_launch(row),
     )  # fmt: skip
 
