@@ -3,14 +3,20 @@
 import ast
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from doc_tables import blocks, drawn, peers, studies
 from doc_tables.__main__ import main
+from doc_tables.results import RESULTS
 from doc_tables.tables import TABLES, headline, whole_calls
+from msgspec import to_builtins
 
 from turbopi.bench.document import read_benchmark
+from turbopi.bench.work import Job
+from turbopi.support.provenance import provenance
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-26_pi05_libero" / "results.json"
@@ -165,7 +171,7 @@ def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
 
 def test_the_plot_beside_others_is_of_the_table() -> None:
     page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
-    assert f"<!-- table: peers {' '.join(f'{peers.FOLDER.name}/{run}' for run in peers.RUNS)} -->" in page
+    assert f"<!-- table: peers {' '.join(peers.RUNS)} -->" in page
     assert peers.PLOT.as_posix() in (ROOT / "README.md").read_text(encoding="utf-8")
     drawn = peers.bars(ROOT)
     assert [name for name, _ in drawn] == [*peers.DRAWN[:-1], "openpi, PyTorch compiled (on the GPU alone)"]
@@ -178,16 +184,33 @@ def test_the_plot_beside_others_is_of_the_table() -> None:
 def test_the_plot_beside_others_is_drawn_anew_for_other_figures(tmp_path: Path) -> None:
     assert peers.stale_peers(tmp_path) == []  # nothing to draw
     (tmp_path / "docs").mkdir()
-    folder = tmp_path / peers.FOLDER
-    folder.mkdir(parents=True)
-    for file in (ROOT / peers.FOLDER).iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
+    folder = (tmp_path / RESULTS / peers.RUNS[0]).parent
+    shutil.copytree(ROOT / RESULTS / folder.name, folder)
     assert len(peers.stale_peers(tmp_path)) == 1
     assert peers.draw_peers(tmp_path) == [tmp_path / peers.PLOT]
     assert peers.stale_peers(tmp_path) == [] == peers.draw_peers(tmp_path)
     file = folder / "flashrt_openpi.jsonl"
     file.write_text(file.read_text().replace("15.019", "15.029"))
     assert len(peers.stale_peers(tmp_path)) == 1
+
+
+def test_a_new_run_beside_others_is_in_the_table_once_it_lies_there(tmp_path: Path) -> None:
+    folder = (tmp_path / RESULTS / peers.RUNS[0]).parent
+    shutil.copytree(ROOT / RESULTS / folder.name, folder)
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    (before,) = re.findall(r"<!-- table: peers .*?<!-- end of table -->", page, re.DOTALL)
+    assert blocks.filled(before, tmp_path, tmp_path / "docs") == before
+    timed = {"program": "flashrt", "setting": "bf16", "part": "whole call", "job": to_builtins(Job()), "calls": 3}
+    timed |= {"p50_ms": 17.5, "p95_ms": 18.0, "rounds_ms": [17.5], "setup_s": 1.0, "actions": [10, 32]}
+    run = {"kind": "turbopi-peers", "provenance": to_builtins(provenance(torch.device("cpu"))), "clocks": []}
+    run |= {"command": [], "small": False, "timed": [timed | {"versions": {}, "note": ""}], "not_measured": []}
+    new = tmp_path / RESULTS / "h200_2026-12-01_peers" / "peers.json"
+    new.parent.mkdir()
+    new.write_text(json.dumps(run))
+    after = blocks.filled(before, tmp_path, tmp_path / "docs")
+    assert "| FlashRT, bf16 | 17.50 |  |  |  |" in after and "| FlashRT, FP8 (2026-11-28) | 15.02 |" in after
+    assert "(../benchmarks/results/h200_2026-12-01_peers/peers.json)" in after
+    assert ("FlashRT, bf16", 17.5) in peers.bars(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from doc_tables import peers as table
 from peers import __main__ as tool
 from peers import document, entries, installing, running
 from peers.document import NotMeasured, Timed, read_peers_run
+from peers.drivers import rounds
 from rich.console import Console
 
 from turbopi.bench.work import Job
@@ -26,8 +27,11 @@ import json, os, subprocess, sys, time
 job = json.loads(sys.argv[1])
 fault = job.get("fault", "")
 def say(line): print(line if isinstance(line, str) else json.dumps(line), flush=True)
+def note(what): open(os.path.join(os.path.dirname(__file__), job["program"] + what), "w").write(str(time.monotonic()))
+if fault == "tells when": note(" begin")
 if fault == "no start": sys.exit("no such GPU")
 if fault == "hangs at start": time.sleep(60)
+if fault == "tells when": note(" ready")
 if fault == "chats": say("loading weights ...")
 say({"ready": True, "note": "a fake", "versions": {"fake": "1"}, "setup_s": 0.1})
 if fault == "speaks twice": say({"ready": True})
@@ -36,6 +40,7 @@ for number, line in enumerate(sys.stdin):
     if fault == "dies" and number: os._exit(3)
     if fault == "hangs" and number: time.sleep(60)
     if fault == "garbage": say("<html>"); continue
+    if fault == "slow": calls = 3 if json.loads(line)["seconds"] == 0.5 else calls
     with open(os.environ["TURNS"], "a") as turns: turns.write(job["program"] + " ")
     part = {"ms": [2.0 + number] * calls, "shape": [job["horizon"], 32], "finite": True}
     part |= job.get("answer", {})
@@ -44,6 +49,8 @@ for number, line in enumerate(sys.stdin):
     say({"whole call": part, **({"on the GPU": part} if not (fault == "forgets" and number) else {})})
     if fault == "quits": os._exit(5)
 """
+
+FAULTS = (("a", ""), ("b", "dies"), ("c", "no start"))
 
 
 @pytest.fixture
@@ -114,6 +121,49 @@ def test_a_program_that_hangs_is_ended(fake: entries.Program, fault: str, limits
     assert not found and said in lost.reason
 
 
+@pytest.mark.parametrize(("part_s", "calls"), [(0.5, 9), (7.0, 15), (None, 15)])
+def test_a_slow_programs_calls_may_be_fewer(fake: entries.Program, part_s: float | None, calls: int) -> None:
+    settings = [(fake, "bf16", sys.executable, {"fault": "slow"})]
+    limits = replace(LIMITS, part_s=part_s)
+    found, lost = running.time_job(settings, JOB, rounds=3, calls=5, limits=limits)
+    assert not lost and [one.calls for one in found] == [calls, calls]
+
+
+def test_a_drivers_calls_of_a_part_end_with_its_time_but_three() -> None:
+    count = iter(range(100))
+    part = rounds.clocked(lambda: next(count), lambda number: [[number] * 32] * 10)
+    assert len(rounds._times(part, 20, 0.0)["ms"]) == rounds.FEWEST == next(count)
+    assert len(rounds._times(part, 20, None)["ms"]) == 20
+
+
+def test_figures_are_told_after_each_round(fake: entries.Program) -> None:
+    settings = [(replace(fake, name=name), "bf16", sys.executable, {"fault": fault}) for name, fault in FAULTS]
+    told: list[tuple[list[int], list[str]]] = []
+    running.time_job(
+        settings,
+        JOB,
+        rounds=3,
+        calls=2,
+        limits=LIMITS,
+        after_round=lambda timed, lost: told.append(([one.calls for one in timed], [one.program for one in lost])),
+    )
+    assert told == [([2, 2, 2, 2], ["c"]), ([4, 4], ["c", "b"]), ([6, 6], ["c", "b"])]
+
+
+def test_programs_that_tune_themselves_get_ready_alone(fake: entries.Program, tmp_path: Path) -> None:
+    """The others stand ready by then, and each tunes by itself."""
+    settings = [
+        (replace(fake, name=name, tunes=name < "c"), "bf16", sys.executable, {"fault": "tells when"}) for name in "abcd"
+    ]
+    said: list[str] = []
+    running.time_job(settings, JOB, rounds=1, calls=1, limits=LIMITS, say=said.append)
+    assert [line.split()[0] for line in said] == ["c", "d", "a", "b"]
+    begin, ready = (
+        {one: float((tmp_path / f"{one} {what}").read_text()) for one in "abcd"} for what in ("begin", "ready")
+    )
+    assert max(ready["c"], ready["d"]) < begin["a"] and ready["a"] < begin["b"]
+
+
 def test_what_a_program_started_ends_with_it(fake: entries.Program, tmp_path: Path) -> None:
     found, lost = timed(fake, {"fault": "leaves a server", "pid": str(tmp_path / "pid")})
     assert not lost and found
@@ -153,11 +203,11 @@ def test_each_programs_plan_is_whole(program: entries.Program, tmp_path: Path) -
     compile(program.script.read_text(), program.script.name, "exec")
     plan = installing.commands(program, tmp_path, "90")
     words = [word for command in plan for word in command]
-    assert not any("{" + name + "}" in word for word in words for name in ("python", "src", "arch"))
+    assert not any("{" + name + "}" in word for word in words for name in ("python", "tool", "src", "arch"))
     if program.git:
         assert program.git[1] in words and len(program.git[1]) == 40
     for command in plan[1:]:
-        if "pip" in command and "-e" not in command:
+        if "pip" in command:
             assert any("==" in word for word in command), command
     assert bool(plan) == (program is not entries.OURS)
     offline = installing.commands(program, tmp_path, "90", src="/sources", site_packages=True)
@@ -202,6 +252,16 @@ def test_a_run_is_one_file_that_the_table_is_written_from(
         "| SGLang, bf16 | not measured | | | |",
     ]
     assert tool.main([*words, "--dry-run", "--peers=lerobot"], Console(file=out, width=200)) == 0
+    out.truncate(0)
+    assert tool.main([*words, "--dry-run", "--without=lerobot=bf16 eager"], Console(file=out, width=200)) == 0
+    assert "turbopi, bf16" in out.getvalue() and "lerobot" not in out.getvalue()
+    older = table.Run(
+        "2026-11-28", {("sglang", "bf16", table.WHOLE, 10): 40.0, ("turbopi", "bf16", table.WHOLE, 10): 7.0}
+    )
+    newer = table.read_run(file)._replace(date="2026-11-29")
+    rows = table.peers(older, newer)[2:]
+    assert rows[0] == "| Turbo-Pi, bf16 | 2.50 | 2.50 | 2.50 | 2.50 |"
+    assert rows[2] == "| SGLang, bf16 (2026-11-28) | 40.00 |  |  |  |"  # the newer run has no figure of it
     small = json.loads(file.read_text()) | {"small": True}
     file.write_text(json.dumps(small))
     with pytest.raises(ConfigError, match="small models"):
@@ -214,6 +274,8 @@ def test_a_run_is_one_file_that_the_table_is_written_from(
         (["run", "--peers=tensorrt"], "no program is named 'tensorrt'; expected some of flashrt"),
         (["run", "--python", "lerobot"], "expected NAME=PATH"),
         (["run", "--horizons=ten"], "ten"),
+        (["run", "--without=flashrt=fp8"], "--without flashrt=fp8: expected bf16; fp8 nt_autotune=force; fp8"),
+        (["run", "--without=tensorrt=bf16"], "--without tensorrt=bf16: expected a NAME of turbopi, flashrt"),
     ],
 )
 def test_a_wrong_word_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from doc_tables import peers
 from doc_tables.measured import kernels_of
+from doc_tables.results import RESULTS, result_files
 
 from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.support.errors import ConfigError
@@ -16,7 +17,6 @@ _COLUMNS = (
     *("GPU", "model", "program", "precision", "cameras", "prompt tokens", "H", "steps", "batch", "a chunk is"),
     *("whole call, ms", "95th percentile", "on the GPU, ms", "× floor", "error", "raw file"),
 )
-_RESULTS = Path("benchmarks") / "results"
 _INTRODUCTION = """---
 hide: [navigation, toc]
 ---
@@ -46,17 +46,17 @@ def measurements(root: Path) -> str:
 
 
 def _link(root: Path, file: Path) -> str:
-    return f"[{file.relative_to(root / _RESULTS)}](../{file.relative_to(root).as_posix()})"
+    return f"[{file.relative_to(root / RESULTS)}](../{file.relative_to(root).as_posix()})"
 
 
 def _ours(root: Path) -> Iterator[list[str]]:
     kernels = kernels_of(root)
-    for file in sorted((root / _RESULTS).rglob("*.json")):
+    for file in sorted((root / RESULTS).rglob("*.json")):
         try:
             document = read_benchmark(file)
         except ConfigError:
             continue  # another kind of result
-        portable = "portable" in kernels.get(file.relative_to(root / _RESULTS).as_posix(), {}).values()
+        portable = "portable" in kernels.get(file.relative_to(root / RESULTS).as_posix(), {}).values()
         yield from _of_document(document, ", portable kernels" * portable, _link(root, file))
 
 
@@ -78,9 +78,10 @@ def _of_document(document: BenchDocument, kernels: str, link: str) -> Iterator[l
 def _others(root: Path) -> Iterator[list[str]]:
     """Other programs' medians, of the job that README compares: Pi0.5, 2 cameras, 48 prompt tokens, 10 steps."""
     shown = {program: name for name, program in peers.SHOWN.items()}
-    for file in (root / peers.FOLDER / run for run in peers.RUNS if not run.startswith("ours")):
-        measured = peers.read_run(file)
-        for program, setting, horizon in sorted({(key[0], key[1], key[3]) for key in measured if measured[key]}):
+    for file in (root / RESULTS / run for run in result_files(root, peers.RUNS)):
+        measured = peers.read_run(file).ms
+        of_others = {(key[0], key[1], key[3]) for key in measured if measured[key] and key[0] != "turbopi"}
+        for program, setting, horizon in sorted(of_others):
             name, _, precision = shown.get((program, setting), f"{program}, {setting}").partition(", ")
             whole, device = (measured.get((program, setting, kind, horizon)) for kind in (peers.WHOLE, peers.DEVICE))
             times = ["" if whole is None else f"{whole:.2f}", "", "" if device is None else f"{device:.2f}", "", ""]

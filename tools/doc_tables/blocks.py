@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from doc_tables.results import RESULTS, result_files
 from doc_tables.tables import TABLES, Table
 
-RESULTS = Path("benchmarks") / "results"
 _BLOCK = re.compile(r"<!-- table: (?P<what>[^\n]*?) -->\n(?P<text>.*?)<!-- end of table -->", re.DOTALL)
 
 
@@ -28,7 +28,8 @@ def filled(text: str, root: Path, folder: Path) -> str:
     """
 
     def written(found: re.Match[str]) -> str:
-        name, *files = found["what"].split()
+        name, *names = found["what"].split()
+        files = result_files(root, names)
         if name not in TABLES:
             raise TableError(f"no table is named {name!r}: there are {', '.join(sorted(TABLES))}")
         table = TABLES[name]

@@ -6,6 +6,7 @@ from pathlib import Path
 from msgspec import Struct
 from msgspec.structs import replace
 
+from doc_tables.results import RESULTS
 from turbopi.bench.document import Result, Times, read_benchmark
 from turbopi.bench.measured import Kernels, MeasuredCall
 from turbopi.bench.predict import STAGES
@@ -14,7 +15,6 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document, read_document
 
 SOURCES = Path("benchmarks") / "measured.json"
-RESULTS = Path("benchmarks") / "results"
 WRITTEN = Path("src/turbopi/data/measured_calls.json")
 
 

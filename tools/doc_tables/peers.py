@@ -1,16 +1,17 @@
-"""Our latency beside other programs': docs/performance.md's table, README's plot, from h200_2026-11-28_peers/.
+"""Our latency beside other programs': docs/performance.md's table, README's plot, from the runs that RUNS names.
 
-A run is a file of `python -m peers run` (tools/peers). Older ones are as their program wrote them: ours a benchmark
-(.json), the others a JSON object a line (.jsonl) or a line of text each (.txt). What was built how: the README beside
-them.
+A run is a file of `python -m peers run` (tools/peers): below benchmarks/results/ under a name of RUNS' last, it counts.
+A program's figures are of the newest run that has some; those of earlier runs have their date. The first runs are as
+their programs wrote them: ours a benchmark (.json), the others a JSON object a line (.jsonl) or a line of text each
+(.txt). What was built how: the README beside them.
 """
 
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from matplotlib.figure import Figure
 from msgspec import Meta, Struct
@@ -19,6 +20,7 @@ from peers.document import PARTS, Part, read_peers_run
 from PIL import Image
 
 from doc_tables.drawn import compacted
+from doc_tables.results import RESULTS, result_files
 from turbopi.bench.document import read_benchmark
 from turbopi.bench.plots import DRAWN_OF
 from turbopi.bench.work import Job
@@ -26,8 +28,12 @@ from turbopi.support.errors import ConfigError
 from turbopi.support.plots import MEASURED, MUTED, write_figure
 from turbopi.support.reading import as_document, read_json
 
-FOLDER = Path("benchmarks") / "results" / "h200_2026-11-28_peers"
-RUNS = ("ours_beside_flashrt_openpi.json", "flashrt_openpi.jsonl", "realtime_vla.txt", "lerobot.jsonl")
+_FIRST = "h200_2026-11-28_peers"
+RUNS = (  # docs/performance.md's table names the same; older ones first
+    *(f"{_FIRST}/{file}" for file in ("ours_beside_flashrt_openpi.json", "flashrt_openpi.jsonl")),
+    *(f"{_FIRST}/{file}" for file in ("realtime_vla.txt", "lerobot.jsonl")),
+    "h200_*_peers/peers*.json",
+)
 PLOT = Path("docs") / "latency.png"
 TEXT = "#7d8590"  # legible on white and on black: the background is the page's
 
@@ -35,6 +41,12 @@ WHOLE, DEVICE = PARTS
 Key = tuple[str, str, Part, int]  # program, setting, WHOLE or DEVICE, horizon
 # Medians of one job: Pi0.5 of full size, 2 cameras, 48 prompt tokens, 10 steps. None: tried, and the file says why not.
 Milliseconds = Mapping[Key, float | None]
+
+
+class Run(NamedTuple):
+    date: str  # of its folder's name, "2026-11-28"; "" if it has none
+    ms: Milliseconds
+
 
 # name in the documents -> (program, setting), as the outputs name them
 SHOWN = {
@@ -67,14 +79,29 @@ class _Row(Struct, frozen=True):
     p50_ms: Annotated[float, Meta(gt=0)]
 
 
-def read_run(file: Path) -> Milliseconds:
-    """Medians of one run's jobs that the table has. Raises ConfigError, a ValueError, for a file without any."""
+def read_run(file: Path) -> Run:
+    """Medians of a run's jobs that the table has. Raises ConfigError, a ValueError, for a file without any."""
     read = {".json": _json, ".jsonl": _rows, ".txt": _lines}.get(file.suffix)
     if read is None:
         raise ConfigError(f"{file}: a peer's run is a .json, .jsonl or .txt file")
     found = read(file)
     if not found:
         raise ConfigError(f"{file} has no job of 2 cameras, 48 prompt tokens and 10 steps; expected a run of a peer")
+    date = re.search(r"_(\d{4}-\d\d-\d\d)_", file.parent.name)
+    return Run(date[1] if date else "", found)
+
+
+def newest(runs: Sequence[Run]) -> dict[tuple[str, str], Run]:
+    """By program and setting its figures in the newest run that has some, of one date. runs: older ones first."""
+    found: dict[tuple[str, str], Run] = {}
+    for run in runs:
+        for program in {key[:2] for key in run.ms}:
+            own = {key: ms for key, ms in run.ms.items() if key[:2] == program}
+            before = found.get(program, Run("", {}))
+            if before.date == run.date:
+                own = {**before.ms, **own}
+            if any(own.values()) or not any(before.ms.values()):
+                found[program] = Run(run.date, own)
     return found
 
 
@@ -116,17 +143,26 @@ def _lines(file: Path) -> Milliseconds:
     return {(of["program"], of["setting"], DEVICE, int(of["horizon"])): float(of["ms"]) for of in lines if of}
 
 
-def peers(*runs: Milliseconds) -> list[str]:
+def peers(*runs: Run) -> list[str]:
     """Each program: medians of whole calls and of the GPU's part alone, with chunks of 10 and of 50."""
-    every = {key: ms for run in runs for key, ms in run.items()}
+    every = newest(runs)
     lines = [f"| ms | {WHOLE}, H = 10 | H = 50 | {DEVICE}, H = 10 | H = 50 |", "|---|--:|--:|--:|--:|"]
     for name, program in SHOWN.items():
-        cells = [every.get((*program, kind, horizon)) for kind in (WHOLE, DEVICE) for horizon in (10, 50)]
+        if program not in every:
+            continue
+        date, figures = every[program]
+        cells = [figures.get((*program, kind, horizon)) for kind in (WHOLE, DEVICE) for horizon in (10, 50)]
         if any(cells):
+            name += _dated(date, runs)
             lines.append("| " + " | ".join([name, *("" if ms is None else _shown(ms) for ms in cells)]) + " |")
-        elif any(key[:2] == program for key in every):
+        else:
             lines.append(f"| {name} | not measured | | | |")
     return lines
+
+
+def _dated(date: str, runs: Sequence[Run]) -> str:
+    """What says that figures aren't the newest run's."""
+    return "" if date == max(run.date for run in runs) else f" ({date})"
 
 
 def _shown(ms: float) -> str:
@@ -138,12 +174,14 @@ def _shown(ms: float) -> str:
 
 def bars(root: Path) -> list[tuple[str, float]]:
     """(name, milliseconds) of the plot's programs with chunks of 10: a whole call, or else the GPU's part; if any."""
-    every = {key: ms for run in RUNS for key, ms in read_run(root / FOLDER / run).items()}
+    runs = [read_run(root / RESULTS / file) for file in result_files(root, RUNS)]
+    every = newest(runs)
     found = []
     for name in DRAWN:
-        whole, device = (every.get((*SHOWN[name], kind, 10)) for kind in (WHOLE, DEVICE))
+        date, figures = every.get(SHOWN[name], Run("", {}))
+        whole, device = (figures.get((*SHOWN[name], kind, 10)) for kind in (WHOLE, DEVICE))
         if ms := whole or device:
-            found.append((name if whole else f"{name} ({DEVICE} alone)", ms))
+            found.append(((name if whole else f"{name} ({DEVICE} alone)") + _dated(date, runs), ms))
     return found
 
 
@@ -178,14 +216,14 @@ def draw_peers(root: Path) -> list[Path]:
 
 def stale_peers(root: Path) -> list[str]:
     """One line if the plot is missing, or was drawn of other figures."""
-    if not (root / FOLDER).is_dir():
+    if not (root / RESULTS / RUNS[0]).is_file():
         return []
     if not (root / PLOT).is_file():
         return [f"{PLOT.as_posix()}: there is no such plot; run scripts/tables"]
     with Image.open(root / PLOT) as image:
         drawn_of = image.info.get(DRAWN_OF)
     if drawn_of != _fingerprint(root):
-        return [f"{PLOT.as_posix()}: drawn of other figures than {FOLDER.as_posix()} has; run scripts/tables"]
+        return [f"{PLOT.as_posix()}: drawn of other figures than the runs have; run scripts/tables"]
     return []
 
 

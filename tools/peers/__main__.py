@@ -7,12 +7,13 @@
 
 Pi0.5 of full size, random weights, the same job for all. Turbo-Pi always runs too. For each horizon all programs stand
 ready, in processes of their own, and are called in turns, so they need room on the GPU together: some 100 GB for all.
-What can't be installed, doesn't start or fails in a call is in the file with its reason, and has no figures.
-Exit code 1 if a program that was asked for has none.
+The file is written after each round. What can't be installed, doesn't start or fails in a call is in it with its
+reason, and has no figures. Exit code 1 if a program that was asked for has none.
 """
 
 import argparse
 import sys
+import tempfile
 from pathlib import Path
 
 import torch
@@ -46,6 +47,9 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     installing.add_argument("--site-packages", action="store_true", help="environments see this Python's packages")
     running = verbs.add_parser("run", help="time programs beside Turbo-Pi")
     running.add_argument("--peers", default="all", help=f"some of {','.join(OTHERS)}; all")
+    running.add_argument(
+        "--without", action="append", default=[], metavar="NAME=SETTING", help="leave out: 'openpi-pytorch=bf16 eager'"
+    )
     running.add_argument("--out", type=Path, metavar="FILE")
     running.add_argument(
         "--python", action="append", default=[], metavar="NAME=PATH", help="an environment that exists"
@@ -59,6 +63,7 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     running.add_argument("--calls", type=int, default=40, help="of each part in a round")
     running.add_argument("--start-s", type=float, metavar="S", help="to get ready, instead of each program's own limit")
     running.add_argument("--round-s", type=float, default=120.0, metavar="S", help="for a round's calls")
+    running.add_argument("--part-s", type=float, metavar="S", help="for a part's calls in a round: then they are fewer")
     running.add_argument("--device", choices=("cuda", "cpu"), default="cuda" if torch.cuda.is_available() else "cpu")
     running.add_argument("--small", action="store_true", help="small models, to try the tool; no figure")
     for verb in (installing, running):
@@ -90,7 +95,8 @@ def show(home: Path, console: Console) -> int:
     table = Table("program", "settings", "from", "state", box=None)
     for program in PROGRAMS:
         repository, commit = program.git or ("", "")
-        source = f"{repository} {commit[:8]}" if repository else " ".join(" ".join(c[4:]) for c in program.install)
+        pinned = " ".join(word for command in program.install for word in command if "==" in word)
+        source = f"{repository} {commit[:8]}" if repository else pinned
         table.add_row(program.name, "; ".join(program.settings), source or "here", missing(program, home) or "ready")
     console.print(table)
     return 0
@@ -115,46 +121,89 @@ def install_all(programs: list[Program], given: argparse.Namespace, console: Con
     return int(failed)
 
 
+Setting = tuple[Program, str, str, dict[str, object]]  # program, setting, its Python, words of its driver
+
+
 def run(programs: list[Program], given: argparse.Namespace, console: Console) -> int:
-    pythons, sources = (_named(pairs) for pairs in (given.python, given.src))
     jobs = [Job(given.cameras, given.prompt_tokens, int(horizon), given.steps) for horizon in given.horizons.split(",")]
+    with tempfile.TemporaryDirectory(prefix="peers-run-") as shared:
+        settings, lost = to_run([OURS, *programs], given, shared)
+        if not given.dry_run:
+            return time_all(settings, lost, jobs, given, console)
+    for program, setting, python, _ in settings:
+        console.print(escape(f"{program.name}, {setting}: {python} {program.script.name}"))
+    show_lost(lost, console)
+    return 0
+
+
+def to_run(programs: list[Program], given: argparse.Namespace, shared: str) -> tuple[list[Setting], list[NotMeasured]]:
+    """The settings that can run, and those that can't. shared: a folder that lasts as long as the run."""
+    pythons, sources = (_named(pairs) for pairs in (given.python, given.src))
+    without = left_out(given.without)
     lost: list[NotMeasured] = []
-    settings = []
-    for program in [OURS, *programs]:
+    settings: list[Setting] = []
+    for program in programs:
         reason = None if program.name in pythons else missing(program, given.home)
         if reason is None and program.needs_checkpoint and given.checkpoint is None:
             reason = _ABOUT_CHECKPOINT
         python = pythons.get(program.name, python_of(program, given.home))
-        words = {
+        words: dict[str, object] = {
             "device": given.device,
             "small": given.small,
             "src": str(Path(sources.get(program.name, folder_of(program, given.home) / "src")).resolve()),
             "commit": program.git[1][:8] if program.git else "",
             "checkpoint": str(given.checkpoint.resolve()) if given.checkpoint else None,
+            "shared": shared,
         }
         for setting in program.settings:
-            if given.device == "cpu" and setting.startswith("fp8"):
-                continue  # no program has it there
+            if (program.name, setting) in without or (given.device == "cpu" and setting.startswith("fp8")):
+                continue  # on a CPU no program has FP8
             if reason is None:
                 settings.append((program, setting, python, words))
             else:
                 lost.append(
                     NotMeasured(program=program.name, setting=setting, job=None, stage="install", reason=reason)
                 )
-    if given.dry_run:
-        for program, setting, python, _ in settings:
-            console.print(escape(f"{program.name}, {setting}: {python} {program.script.name}"))
-        show_lost(lost, console)
-        return 0
-    clocks: list[Gpu] = []
+    return settings, lost
+
+
+def left_out(pairs: list[str]) -> set[tuple[str, str]]:
+    """(program, setting) of each NAME=SETTING. Raises ValueError for what no program has."""
+    found = {(name, setting) for name, _, setting in (pair.partition("=") for pair in pairs)}
+    known = {(program.name, setting) for program in BY_NAME.values() for setting in program.settings}
+    for name, setting in found - known:
+        expected = "; ".join(BY_NAME[name].settings) if name in BY_NAME else f"a NAME of {', '.join(BY_NAME)}"
+        raise ValueError(f"--without {name}={setting}: expected {expected}")
+    return found
+
+
+def time_all(
+    settings: list[Setting], lost: list[NotMeasured], jobs: list[Job], given: argparse.Namespace, console: Console
+) -> int:
     device = torch.device("cuda:0" if given.device == "cuda" else "cpu")
+    of_run = provenance(device)
+    clocks: list[Gpu] = []
+    timed: list[Timed] = []
 
     def note_clocks() -> None:
         if gpu := provenance(device).gpu:
             clocks.append(gpu)
 
-    timed: list[Timed] = []
-    of_run = provenance(device)
+    def write(of_job: list[Timed], lost_of_job: list[NotMeasured]) -> None:
+        """After each round: a run that is cut has what it measured."""
+        if given.out is None:
+            return
+        document = PeersRun(
+            kind="turbopi-peers",
+            provenance=of_run,
+            clocks=clocks,
+            command=["python", "-m", "peers", *sys.argv[1:]],
+            small=given.small,
+            timed=[*timed, *of_job],
+            not_measured=[*lost, *lost_of_job],
+        )
+        write_whole(given.out, json.format(json.encode(document), indent=1) + b"\n")
+
     for job in jobs:
         console.print(f"[bold]{job}[/]")
         found, failed = time_job(
@@ -162,22 +211,13 @@ def run(programs: list[Program], given: argparse.Namespace, console: Console) ->
             job,
             rounds=given.rounds,
             calls=given.calls,
-            limits=Limits(given.start_s, given.round_s),
+            limits=Limits(given.start_s, given.round_s, given.part_s),
             before_round=note_clocks,
+            after_round=write,
             say=lambda line: console.print(escape(line)),
         )
         timed, lost = [*timed, *found], [*lost, *failed]
-        if given.out is not None:  # after each job: a run that is cut has its first ones
-            document = PeersRun(
-                kind="turbopi-peers",
-                provenance=of_run,
-                clocks=clocks,
-                command=["python", "-m", "peers", *sys.argv[1:]],
-                small=given.small,
-                timed=timed,
-                not_measured=lost,
-            )
-            write_whole(given.out, json.format(json.encode(document), indent=1) + b"\n")
+        write([], [])
     show_timed(timed, console)
     show_lost(lost, console)
     return int(bool(lost))

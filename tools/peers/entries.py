@@ -1,7 +1,7 @@
 """The programs that are timed: where each comes from, how it is installed, in which settings it runs.
 
-A command's words may have {python} (of the program's own environment), {src} (its sources) and {arch} (the GPU's
-compute capability, "90").
+A command's words may have {python} (of the program's own environment), {tool} (the Python that runs the tool), {src}
+(its sources) and {arch} (the GPU's compute capability, "90").
 """
 
 import os
@@ -19,6 +19,7 @@ class Program:
 
     git      repository and commit that are fetched to {src}
     install  commands, in order, after its environment is made; none: the environment that runs the tool
+    tunes    it times candidates while it gets ready, so nothing else may run then
     """
 
     name: str
@@ -28,6 +29,7 @@ class Program:
     install: tuple[tuple[str, ...], ...] = ()
     python: str | None = None  # that its environment is made with; None: the one that runs the tool
     needs_checkpoint: bool = False
+    tunes: bool = False
     start_s: float = 300.0  # to get ready: compiling and capturing are in it
 
     @property
@@ -43,11 +45,22 @@ class Program:
 
 
 def _pip(*words: str) -> tuple[str, ...]:
-    return ("{python}", "-m", "pip", "install", "--quiet", *words)
+    """The environments have no pip of their own: not every Python brings one for them."""
+    return ("{tool}", "-m", "pip", "--python", "{python}", "install", "--quiet", *words)
 
 
 _CUTLASS = "--branch=v4.4.2 https://github.com/NVIDIA/cutlass {src}/third_party/cutlass"
-_CMAKE = ("-DGPU_ARCH={arch}", "-DFA2_ARCH_NATIVE_ONLY=ON", "-DFA2_HDIMS=96;256", "-DFA2_DTYPES=bf16")
+# Attention's variants that its wrapper never takes: most of the time that the build takes.
+_UNUSED = " ".join(f"-DFLASHATTENTION_DISABLE_{name}" for name in ("DROPOUT", "ALIBI", "SOFTCAP", "LOCAL"))
+_CMAKE = (
+    "-DGPU_ARCH={arch}",
+    "-DFLASHRT_SLIM_BUILD=ON",
+    "-DFA2_ARCH_NATIVE_ONLY=ON",
+    "-DFA2_HDIMS=96;256",
+    "-DFA2_DTYPES=bf16",
+    f"-DCMAKE_CUDA_FLAGS={_UNUSED}",
+)
+_TARGETS = ("flash_rt_kernels", "flash_rt_fa2")  # not its part for JAX
 _ALSO_90 = 's/GPU_ARCH STREQUAL "89"/GPU_ARCH STREQUAL "89" OR GPU_ARCH STREQUAL "90"/'
 # openpi changes files of transformers, as its README says; none but this environment's own.
 _OVER_TRANSFORMERS = (
@@ -68,10 +81,10 @@ PROGRAMS = (
             _pip(_TORCH, "pybind11", "numpy", "pyyaml", "ml_dtypes", "safetensors", "cmake>=3.24"),
             # It names no Hopper: attention is built there as for the RTX 4090.
             ("sed", "-i", f"108{_ALSO_90};1130{_ALSO_90}", "{src}/CMakeLists.txt"),
-            _pip("--no-deps", "-e", "{src}"),
             ("{python}", "-m", "cmake", "-S", "{src}", "-B", "{src}/build", "-DPython3_EXECUTABLE={python}", *_CMAKE),
-            ("{python}", "-m", "cmake", "--build", "{src}/build", f"-j{os.cpu_count() or 1}"),
+            ("{python}", "-m", "cmake", "--build", "{src}/build", f"-j{os.cpu_count() or 1}", "--target", *_TARGETS),
         ),
+        tunes=True,  # cuBLASLt's algorithms
     ),
     Program(
         "realtime-vla",
@@ -89,6 +102,7 @@ PROGRAMS = (
             _pip(_TORCH, "transformers==4.53.2", "numpy"),
             ("{python}", "-c", _OVER_TRANSFORMERS, "{src}/src/openpi/models_pytorch/transformers_replace"),
         ),
+        tunes=True,  # Inductor's tiles
     ),
     Program(
         "lerobot",

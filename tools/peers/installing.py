@@ -36,10 +36,10 @@ def commands(
     if not program.install:
         return []
     folder = folder_of(program, home)
-    values = {"python": python_of(program, home), "src": str(folder / "src"), "arch": arch}
+    values = {"python": python_of(program, home), "tool": sys.executable, "src": str(folder / "src"), "arch": arch}
     seen = [values["python"], "-c", _SEES, "\n".join(site.getsitepackages())]
     return [
-        [program.python or sys.executable, "-m", "venv", str(folder / "venv")],
+        [program.python or sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")],
         *([seen] if site_packages else []),
         *([["cp", "-r", src, values["src"]]] if src else program.fetching(folder / "src")),
         *([_filled(word, values) for word in command] for command in program.install),

@@ -25,6 +25,7 @@ import numpy as np
 import psutil
 
 from peers.document import PARTS, NotMeasured, Part, Stage, Timed
+from peers.drivers.rounds import FEWEST
 from peers.entries import TOOLS, Program
 from turbopi.bench.work import Job
 
@@ -57,13 +58,19 @@ class Limits:
 
     start_s: float | None = None  # instead of each program's own
     round_s: float = 120.0
+    part_s: float | None = None  # for a part's calls in a round: fewer than wanted, if they take longer, and no failure
 
 
 class Running:
-    """One program in one setting, ready for a job. Raises Failed, and ends the process, when it doesn't do as told."""
+    """One program in one setting, getting ready for a job.
 
-    def __init__(self, program: Program, setting: str, python: str, words: Mapping[str, Any], start_s: float) -> None:
-        self.program, self.setting = program, setting
+    Raises Failed, and ends the process, when it doesn't do as told.
+    """
+
+    ready: Ready
+
+    def __init__(self, program: Program, setting: str, python: str, words: Mapping[str, Any]) -> None:
+        self.program, self.setting, self._began = program, setting, time.monotonic()
         self._text, self._ended = "", False  # of its standard error, once it has ended
         self._folder = tempfile.TemporaryDirectory(prefix="peers-")  # the program's working directory
         self._log = Path(self._folder.name) / "log.txt"
@@ -75,7 +82,11 @@ class Running:
         self._lines: queue.Queue[bytes] = queue.Queue()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self.ready = self._said(start_s, Ready, "got ready")
+
+    def wait(self, start_s: float) -> float:
+        """Until it is ready, start_s seconds after its start at the latest. Returns the seconds that it took."""
+        self.ready = self._said(start_s, Ready, "got ready", self._began)
+        return time.monotonic() - self._began
 
     def _listen(self) -> None:
         assert self._process.stdout is not None
@@ -84,7 +95,7 @@ class Running:
                 self._lines.put(line)
         self._lines.put(b"")
 
-    def time(self, calls: int, seconds: float) -> dict[str, Round]:
+    def time(self, calls: int, limits: Limits) -> dict[str, Round]:
         """Its parts, with the milliseconds of each call."""
         if not self._lines.empty():
             if line := self._lines.get():
@@ -92,13 +103,14 @@ class Running:
             self._lines.put(line)  # it has ended
         assert self._process.stdin is not None
         with suppress(OSError):  # it is gone: its end is read below
-            self._process.stdin.write(json.dumps({"calls": calls}).encode() + b"\n")
+            self._process.stdin.write(json.dumps({"calls": calls, "seconds": limits.part_s}).encode() + b"\n")
             self._process.stdin.flush()
-        return self._said(seconds, dict[str, Round], f"answered {calls} calls")
+        return self._said(limits.round_s, dict[str, Round], f"answered {calls} calls")
 
-    def _said(self, seconds: float, kind: Any, what: str) -> Any:
+    def _said(self, seconds: float, kind: Any, what: str, since: float | None = None) -> Any:
+        begin = time.monotonic() if since is None else since
         try:
-            line = self._lines.get(timeout=seconds)
+            line = self._lines.get(timeout=max(0.0, begin + seconds - time.monotonic()))
         except queue.Empty:
             raise self._failed(f"it hadn't {what} after {seconds:g} s") from None
         if not line:
@@ -181,11 +193,13 @@ def time_job(
     calls: int,
     limits: Limits,
     before_round: Callable[[], None] = lambda: None,
+    after_round: Callable[[list[Timed], list[NotMeasured]], None] = lambda timed, lost: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Timed], list[NotMeasured]]:
     """Figures of one job. settings: (program, setting, its Python, words of its driver beside the job's).
 
-    A setting that fails in any round has no figures at all.
+    Programs get ready side by side; those that tune themselves then, one by one. A setting that fails in any round has
+    no figures at all. after_round: is given the figures so far.
     """
     lost: list[NotMeasured] = []
     taken: list[_Taken] = []
@@ -195,38 +209,61 @@ def time_job(
         say(f"{program.name} {setting}: not measured: {reason}")
 
     try:
-        for program, setting, python, words in settings:
-            begin = time.monotonic()
-            try:
-                running = Running(
-                    program,
-                    setting,
-                    python,
-                    {**words, **msgspec.to_builtins(job), "program": program.name, "setting": setting},
-                    limits.start_s or program.start_s,
-                )
-            except Failed as error:
-                lose(program, setting, "start", error)
-                continue
-            say(f"{program.name} {setting}: ready after {time.monotonic() - begin:.0f} s")
-            taken.append(_Taken(running))
+        _get_ready(settings, job, limits, taken, lose, say)
         for number in range(rounds):
             before_round()
             turn = number % max(1, len(taken))
             for one in [*taken[turn:], *taken[:turn]]:  # nobody is always first
                 try:
-                    _take(one, one.running.time(calls, limits.round_s), job, calls)
+                    _take(one, one.running.time(calls, limits), job, calls, limits.part_s is not None)
                 except Failed as error:
                     one.running.end()
                     taken.remove(one)
                     lose(one.running.program, one.running.setting, "call", f"round {number + 1}: {error}")
+            after_round(_all_timed(taken, job), list(lost))
     finally:
         for one in taken:
             one.running.end()
-    return [timed for one in taken for timed in _timed(one, job)], lost
+    return _all_timed(taken, job), lost
 
 
-def _take(one: _Taken, answer: Mapping[str, Round], job: Job, calls: int) -> None:
+def _get_ready(
+    settings: Sequence[tuple[Program, str, str, Mapping[str, Any]]],
+    job: Job,
+    limits: Limits,
+    taken: list[_Taken],
+    lose: Callable[[Program, str, Stage, object], None],
+    say: Callable[[str], None],
+) -> None:
+    """Those that are ready are added to `taken`."""
+
+    def start(program: Program, setting: str, python: str, words: Mapping[str, Any]) -> list[_Taken]:
+        own = {"program": program.name, "setting": setting}
+        try:
+            running = Running(program, setting, python, {**words, **msgspec.to_builtins(job), **own})
+        except Failed as error:
+            lose(program, setting, "start", error)
+            return []
+        taken.append(_Taken(running))
+        return taken[-1:]
+
+    def wait(one: _Taken) -> None:
+        program, setting = one.running.program, one.running.setting
+        try:
+            say(f"{program.name} {setting}: ready after {one.running.wait(limits.start_s or program.start_s):.0f} s")
+        except Failed as error:
+            taken.remove(one)
+            lose(program, setting, "start", error)
+
+    side_by_side = [one for setting in settings if not setting[0].tunes for one in start(*setting)]
+    for one in side_by_side:
+        wait(one)
+    for setting in settings:
+        for one in start(*setting) if setting[0].tunes else []:
+            wait(one)
+
+
+def _take(one: _Taken, answer: Mapping[str, Round], job: Job, calls: int, or_fewer: bool) -> None:
     """Raises Failed for an answer that isn't a policy's."""
     if not answer or not answer.keys() <= set(PARTS):
         raise Failed(f"it timed {sorted(answer)}; expected some of {', '.join(PARTS)}")
@@ -236,7 +273,8 @@ def _take(one: _Taken, answer: Mapping[str, Round], job: Job, calls: int) -> Non
         if part not in answer:
             continue
         found = answer[part]
-        if len(found.ms) != calls or not all(math.isfinite(ms) and ms > 0 for ms in found.ms):
+        fewest = min(calls, FEWEST) if or_fewer else calls
+        if not fewest <= len(found.ms) <= calls or not all(math.isfinite(ms) and ms > 0 for ms in found.ms):
             raise Failed(f"{part}: {len(found.ms)} times of {calls} calls, {found.ms[:3]} …; expected some above 0")
         if len(found.shape) != 2 or found.shape[0] != job.horizon or found.shape[1] not in ACTION_DIMS:
             raise Failed(f"{part}: its actions are {found.shape}; expected [{job.horizon}, d]")
@@ -244,6 +282,10 @@ def _take(one: _Taken, answer: Mapping[str, Round], job: Job, calls: int) -> Non
             raise Failed(f"{part}: its actions have NaN or infinity")
         one.rounds.setdefault(part, []).append(found.ms)
         one.shape = found.shape
+
+
+def _all_timed(taken: list[_Taken], job: Job) -> list[Timed]:
+    return [timed for one in taken for timed in _timed(one, job)]
 
 
 def _timed(one: _Taken, job: Job) -> list[Timed]:

@@ -2,8 +2,9 @@
 
     python run_PROGRAM.py JOB    JOB: {"setting", "cameras", "prompt_tokens", "horizon", "steps", "device", "small", …}
 
-It builds the program once and says so; then, for each line {"calls": n} of its input, it times n calls of each part and
-answers with a line. Its output is for these lines alone: whatever the program prints goes to the standard error.
+It builds the program once and says so; then, for each line {"calls": n, "seconds": s} of its input, it times n calls of
+each part, or fewer where they take longer than s, and answers with a line. Its output is for these lines alone:
+whatever the program prints goes to the standard error.
 Runs in the program's own environment: NumPy is all that it takes for granted.
 """
 
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 WARM_UP = 5  # calls of each part, before it is ready
+FEWEST = 3  # of a part in a round, however slow they are
 Part = Callable[[], tuple[float, Any]]  # one call: milliseconds, actions [..., H, d] on the host
 
 
@@ -63,14 +65,16 @@ def serve(build: Callable[[dict[str, Any]], Built]) -> None:
     found = {name: installed for name in built.packages if (installed := _version(name))} | dict(built.sources)
     say({"ready": True, "note": built.note, "versions": found, "setup_s": round(time.perf_counter() - begin, 1)})
     for line in sys.stdin:
-        calls = json.loads(line)["calls"]
-        say({name: _times(part, calls) for name, part in built.parts.items()})
+        told = json.loads(line)
+        say({name: _times(part, told["calls"], told["seconds"]) for name, part in built.parts.items()})
 
 
-def _times(part: Part, calls: int) -> dict[str, Any]:
+def _times(part: Part, calls: int, seconds: float | None) -> dict[str, Any]:
     taken, actions = [], np.zeros(())
-    finite = True
-    for _ in range(calls):
+    finite, begin = True, time.perf_counter()
+    for number in range(calls):
+        if seconds is not None and number >= FEWEST and time.perf_counter() - begin >= seconds:
+            break
         milliseconds, found = part()
         actions = np.asarray(found, np.float64)
         finite = finite and bool(np.isfinite(actions).all())

@@ -8,6 +8,8 @@ import ctypes
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +81,29 @@ def weights() -> dict[str, torch.Tensor]:
     return found | {name: torch.ones(shape, **made) for name, shape in scales.items()}
 
 
+@contextmanager
+def torchs_cuda_runtime() -> Iterator[None]:
+    """FlashRT opens "libcudart.so", which PyTorch's wheels don't have by that name: it gets the one that is loaded."""
+    load, name = ctypes.CDLL, f"libcudart.so.{(torch.version.cuda or '').partition('.')[0]}"
+
+    def opened(wanted: str, *arguments: Any, **options: Any) -> ctypes.CDLL:
+        return load(name if wanted == "libcudart.so" else wanted, *arguments, **options)
+
+    ctypes.CDLL = opened  # type: ignore[misc, assignment]
+    try:
+        yield
+    finally:
+        ctypes.CDLL = load  # type: ignore[misc]
+
+
 def build(job: dict[str, Any]) -> Built:
     precision, _, autotune = job["setting"].partition(" nt_autotune=")
     if autotune:
         os.environ["FLASHRT_FP8_NT_AUTOTUNE"] = autotune
     os.environ["FVK_PI05_RTX_FORCE_BF16"] = "1" if precision == "bf16" else "0"
     sys.path.insert(0, job["src"])
-    from flash_rt.frontends.torch import pi05_rtx
+    with torchs_cuda_runtime():
+        from flash_rt.frontends.torch import pi05_rtx
 
     torch.manual_seed(0)
 

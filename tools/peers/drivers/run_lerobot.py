@@ -33,7 +33,8 @@ def build(job: dict[str, Any]) -> Built:
         device=device,
     )
     torch.manual_seed(0)
-    policy = PI05Policy(config).eval()
+    with torch.device(device):  # drawing 3 billion weights takes a CPU a minute
+        policy = PI05Policy(config).eval()
     tokens = torch.randint(1, vocabulary, (1, MOST_TOKENS))
     mask = torch.arange(MOST_TOKENS)[None] < job["prompt_tokens"]
     images = random_images(job)

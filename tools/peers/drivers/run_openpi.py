@@ -53,7 +53,9 @@ def build(job: dict[str, Any]) -> Built:
     )
     device = torch.device(job["device"])
     torch.manual_seed(0)
-    model = PI0Pytorch(config).to(device).eval()
+    with device:  # drawing 3 billion weights takes a CPU a minute
+        model = PI0Pytorch(config)
+    model = model.to(device).eval()
     tokens = torch.randint(1, VOCABULARY, (1, MOST_TOKENS)).to(device)
     mask = (torch.arange(MOST_TOKENS)[None] < job["prompt_tokens"]).to(device)
     images = random_images(job)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,8 +19,8 @@ STAGES = ("vision_ms", "prefix_ms", "denoise_ms")
 
 def build(job: dict[str, Any]) -> Built:
     gpu, fp8 = job["device"] == "cuda", job["setting"] == "fp8"
-    quantization = "quantization.json" if fp8 else None
-    if quantization:
+    quantization = str(Path(job["shared"]) / "quantization.json") if fp8 else None
+    if quantization and not Path(quantization).exists():  # once in a run: it is the same for each job
         calibrate = ("calibrate", "--random-weights", PRESET, "--count", "8", "--out", quantization)
         subprocess.run([sys.executable, "-m", "turbopi", *calibrate], check=True)
     checkpoint = open_checkpoint(SMALL_POLICY) if job["small"] else random_checkpoint(PRESET)
