@@ -7,6 +7,7 @@ import pytest
 import torch
 from conftest import gpu_or_interpreter
 from pi0_fast_golden import make_folder, make_hub, policy_of, runs
+from torch import Tensor
 
 from turbopi import UnifiedPolicy
 from turbopi.config import Pi0FastConfig
@@ -15,9 +16,9 @@ from turbopi.models.observation import Observation
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import token
+from turbopi.kernels.portable.token import Int8Rows, Weight
 from turbopi.models.pi0.decoding import Decoding
 from turbopi.models.pi0_fast.reference import Pi0FastModel, compacted
-from turbopi.quantization.fp8 import ScaledMatrix
 
 pytestmark = gpu_or_interpreter()
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -65,8 +66,8 @@ def test_a_token_is_the_references(policy: UnifiedPolicy, name: str) -> None:
 def test_int8_weights_are_what_is_multiplied(policy: UnifiedPolicy, name: str) -> None:
     model = policy.backend.model  # type: ignore[attr-defined]
     rounded, wide = token.JoinedWeights(model, int8=True), token.JoinedWeights(model)
-    assert isinstance(rounded.head, ScaledMatrix) and rounded.head.numbers == torch.int8
-    wide.head, wide.layers = rounded.head.dequantized(), [meant(one) for one in rounded.layers]
+    wide.head, wide.layers = meant(rounded.head), [as_meant(one) for one in rounded.layers]
+    assert (wide.head - model.head).abs().max() <= 0.5001 * rounded.head.scale.max()  # type: ignore[union-attr]
     ours, expected, exact = (begun(policy, name, model, 1) for _ in range(3))
     token.TokenStep(model, rounded, ours)()
     token.TokenStep(model, wide, expected)()
@@ -76,10 +77,13 @@ def test_int8_weights_are_what_is_multiplied(policy: UnifiedPolicy, name: str) -
     assert 1e-4 < error < 0.03, "a row's 255 steps are 0.008 of a normal variable's rms"
 
 
-def meant(layer: token.LayerWeights) -> token.LayerWeights:
-    """The numbers that INT8 stands for."""
-    matrices = (getattr(layer, one.name) for one in fields(layer))
-    return token.LayerWeights(*(one.dequantized() for one in matrices if isinstance(one, ScaledMatrix)))
+def meant(weight: Weight) -> Tensor:
+    assert isinstance(weight, Int8Rows) and weight.words.dtype == torch.int32
+    return weight.meant()
+
+
+def as_meant(layer: token.LayerWeights) -> token.LayerWeights:
+    return token.LayerWeights(*(meant(getattr(layer, one.name)) for one in fields(layer)))
 
 
 @pytest.mark.parametrize("name", ["quantiles_empty_camera"], indirect=True)

@@ -3,7 +3,7 @@
 It computes `Writer.step` in the same buffers, with fewer roundings.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import triton
@@ -11,11 +11,9 @@ from torch import Tensor, nn
 
 from turbopi.config import ModelConfig, Pi0FastConfig
 from turbopi.kernels.portable import token as kernels
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.token import Int8Rows, Weight
 from turbopi.models.pi0.decoding import Decoding, Writer
 from turbopi.models.pi0.layers import rope_tables
-from turbopi.quantization.formats import INT8
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix
 
 ROWS = 1 << 14  # of a matrix that are rounded at a time, for which float32 has to have room
 
@@ -36,11 +34,11 @@ def refuses(config: Pi0FastConfig | ModelConfig) -> str | None:
 class LayerWeights:
     """[out, in] each; `qkv`: the queries', keys' and values' rows."""
 
-    qkv: Matrix
-    out: Matrix
-    gate: Matrix
-    up: Matrix
-    down: Matrix
+    qkv: Weight
+    out: Weight
+    gate: Weight
+    up: Weight
+    down: Weight
 
 
 class JoinedWeights:
@@ -63,12 +61,12 @@ class JoinedWeights:
             others = (layer.self_attn.o_proj, mlp.gate_proj, mlp.up_proj, mlp.down_proj)
             matrices = [joined, *(one.weight.detach() for one in others)]
             self.layers.append(LayerWeights(*(_rounded(one) if int8 else one for one in matrices)))
-        self.head: Matrix = _rounded(model.head) if int8 else model.head
+        self.head: Weight = _rounded(model.head) if int8 else model.head
 
 
-def _rounded(weight: Tensor) -> ScaledMatrix:
-    parts = [quantize(rows, 1.0, format=INT8) for rows in torch.split(weight.detach(), ROWS)]
-    return replace(parts[0], data=torch.cat([one.data for one in parts]), scale=torch.cat([one.scale for one in parts]))
+def _rounded(weight: Tensor) -> Int8Rows:
+    parts = [Int8Rows.of(rows) for rows in torch.split(weight.detach(), ROWS)]
+    return Int8Rows(torch.cat([one.words for one in parts]), torch.cat([one.scale for one in parts]))
 
 
 class TokenStep:

@@ -8,30 +8,63 @@ Shapes: D width, H query heads, K head_dim, S places of keys and values, C share
 """
 
 import math
+from dataclasses import dataclass
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor, nn
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.kernels.portable.activations import gelu_tanh
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.portable.rope import rotated
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix
+from turbopi.quantization.formats import INT8
 
 PLACES = 32  # of keys and values, a program's
 LOGITS = 2048  # among which a program finds the best
 ROWS, BLOCK = 4, 2048  # of a weight, a program's at a time: 16 KB in flight are the fastest, whatever the weight's size
+INT8_ROWS = 8  # as many bytes in flight
 _pow2 = triton.next_power_of_2
+
+
+@dataclass(frozen=True)
+class Int8Rows:
+    """A weight [N, D] in INT8, symmetric, with a scale for each row. A word has a number of each quarter of its row, so
+    that neighbours multiply neighbours.
+
+    words  int32[N, D / 4]: bytes 0 to 3 are 128 + the numbers at q, q + D / 4, q + D / 2 and q + 3 D / 4
+    scale  float32[N]
+    """
+
+    words: Tensor
+    scale: Tensor
+
+    @classmethod
+    def of(cls, weight: Tensor) -> "Int8Rows":
+        """Rounded to nearest. D is a multiple of 4."""
+        rounded = quantize(weight, 1.0, format=INT8)
+        rows, width = weight.shape
+        turned = rounded.data.view(torch.uint8) ^ 0x80
+        words = turned.view(rows, 4, width // 4).transpose(1, 2).contiguous().view(torch.int32)
+        return cls(words.view(rows, width // 4), rounded.scale)
+
+    def meant(self) -> Tensor:
+        """float32[N, D]: what the numbers stand for."""
+        numbers = (self.words.view(torch.uint8).view(*self.words.shape, 4) ^ 0x80).view(torch.int8)
+        return numbers.transpose(1, 2).flatten(1).float() * self.scale[:, None]
+
+
+Weight = Tensor | Int8Rows
 
 
 @triton.jit
 def _row_product_kernel(
-    row, norm, weight, beside, scales, beside_scales, out, rows, width, eps,
-    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr, SCALED: tl.constexpr,
+    row, norm, weight, beside, out, rows, width, eps,
+    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr,
     ROWS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """out [rows] = weight [rows, width] · row [width]; GATED: gelu(that) times `beside` · row; ADD: `out` plus that.
-    SCALED: a weight's rows are numbers times their scales.
 
     NORM: the row is first divided by its rms and scaled; it needs BLOCK >= width, and so does GATED.
     """
@@ -42,10 +75,6 @@ def _row_product_kernel(
     part = tl.load(weight + at, there, 0.0)
     if GATED:
         other = tl.load(beside + at, there, 0.0)
-    if SCALED:
-        factor = tl.load(scales + n, n < rows, 0.0)
-        if GATED:
-            other_factor = tl.load(beside_scales + n, n < rows, 0.0)
     if NORM:
         scale = tl.load(norm + k, k < width, 0.0).to(tl.float32)
     wait_for_producer(PDL)
@@ -55,18 +84,73 @@ def _row_product_kernel(
         x *= tl.rsqrt(tl.sum(x * x, 0) / width + eps) * (1 + scale)
     total = tl.sum(part.to(tl.float32) * x[None, :], 1)
     if GATED:
-        up = tl.sum(other.to(tl.float32) * x[None, :], 1)
-        if SCALED:
-            total, up = total * factor, up * other_factor
-        total = gelu_tanh(total) * up
+        total = gelu_tanh(total) * tl.sum(other.to(tl.float32) * x[None, :], 1)
     else:
         for start in range(BLOCK, width, BLOCK):
             there = (n < rows)[:, None] & (k + start < width)[None, :]
             part = tl.load(weight + at + start, there, 0.0)
             x = tl.load(row + k + start, k + start < width, 0.0)
             total += tl.sum(part.to(tl.float32) * x[None, :], 1)
-        if SCALED:
-            total *= factor
+    if ADD:
+        total += tl.load(out + n, n < rows, 0.0)
+    tl.store(out + n, total, n < rows)
+
+
+@triton.jit
+def _number(words, byte: tl.constexpr):
+    """A byte of `Int8Rows` as float32: the bits of 2^23 + that byte, less 2^23 + 128. The GPU's own conversion of int8
+    takes longer than reading the weights (docs/dev/log/portable.md).
+    """
+    return (((words >> (8 * byte)) & 0xFF) | 0x4B000000).to(tl.float32, bitcast=True) - 8388736.0
+
+
+@triton.jit
+def _sums(words, x0, x1, x2, x3):
+    low = _number(words, 0) * x0[None, :] + _number(words, 1) * x1[None, :]
+    return tl.sum(low + (_number(words, 2) * x2[None, :] + _number(words, 3) * x3[None, :]), 1)
+
+
+@triton.jit
+def _quarters(row, q, quarter, there):
+    x0, x1 = tl.load(row + q, there, 0.0), tl.load(row + quarter + q, there, 0.0)
+    x2, x3 = tl.load(row + 2 * quarter + q, there, 0.0), tl.load(row + 3 * quarter + q, there, 0.0)
+    return x0, x1, x2, x3
+
+
+@triton.jit
+def _int8_row_product_kernel(
+    row, norm, weight, scales, beside, beside_scales, out, rows, quarter, eps,
+    NORM: tl.constexpr, GATED: tl.constexpr, ADD: tl.constexpr,
+    ROWS: tl.constexpr, WORDS: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """`_row_product_kernel` of `Int8Rows`, whose width is 4 * quarter; NORM and GATED need WORDS >= quarter."""
+    n = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    q = tl.arange(0, WORDS)
+    at = n[:, None] * quarter + q[None, :]
+    there = (n < rows)[:, None] & (q < quarter)[None, :]
+    part, scale = tl.load(weight + at, there, 0), tl.load(scales + n, n < rows, 0.0)
+    if GATED:
+        other, other_scale = tl.load(beside + at, there, 0), tl.load(beside_scales + n, n < rows, 0.0)
+    if NORM:
+        s0, s1, s2, s3 = _quarters(norm, q, quarter, q < quarter)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    x0, x1, x2, x3 = _quarters(row, q, quarter, q < quarter)
+    if NORM:
+        squares = tl.sum(x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3, 0)
+        inverse = tl.rsqrt(squares / (4 * quarter) + eps)
+        x0, x1 = x0 * inverse * (1 + s0.to(tl.float32)), x1 * inverse * (1 + s1.to(tl.float32))
+        x2, x3 = x2 * inverse * (1 + s2.to(tl.float32)), x3 * inverse * (1 + s3.to(tl.float32))
+    total = _sums(part, x0, x1, x2, x3)
+    if GATED:
+        total = gelu_tanh(total * scale) * (_sums(other, x0, x1, x2, x3) * other_scale)
+    else:
+        for start in range(WORDS, quarter, WORDS):
+            further = start + q < quarter
+            part = tl.load(weight + at + start, (n < rows)[:, None] & further[None, :], 0)
+            x0, x1, x2, x3 = _quarters(row, start + q, quarter, further)
+            total += _sums(part, x0, x1, x2, x3)
+        total *= scale
     if ADD:
         total += tl.load(out + n, n < rows, 0.0)
     tl.store(out + n, total, n < rows)
@@ -188,23 +272,32 @@ def _embed_id_kernel(chosen, table, out, width, scale, BLOCK: tl.constexpr, PDL:
 
 
 def row_product(
-    row: Tensor, weight: Matrix, out: Tensor, *, norm: nn.Module | None = None, eps: float = 0.0,
-    beside: Matrix | None = None, add: bool = False,
+    row: Tensor, weight: Weight, out: Tensor, *, norm: nn.Module | None = None, eps: float = 0.0,
+    beside: Weight | None = None, add: bool = False,
 ) -> None:  # fmt: skip
     """weight [N, D] times row float32[D] -> out float32[N]; `norm`'s weight: of the RMSNorm that comes first.
 
     beside  [N, D], in the weight's numbers: out is gelu(weight · row) times (beside · row)
     add     to what `out` holds
     """
+    other, scale = weight if beside is None else beside, row if norm is None else norm.get_parameter("weight")
+    if isinstance(weight, Int8Rows):
+        assert isinstance(other, Int8Rows)
+        rows, quarter = weight.words.shape
+        whole = _pow2(quarter)
+        _int8_row_product_kernel[(triton.cdiv(rows, INT8_ROWS),)](
+            row, scale, weight.words, weight.scale, other.words, other.scale, out, rows, quarter, eps,
+            NORM=norm is not None, GATED=beside is not None, ADD=add,
+            ROWS=INT8_ROWS, WORDS=whole if norm is not None else min(BLOCK // 4, whole), num_warps=4,
+            **dependent_launch(row),
+        )  # fmt: skip
+        return
+    assert isinstance(other, Tensor)
     rows, width = weight.shape
-    whole, other = _pow2(width), weight if beside is None else beside
-    numbers, scales = (weight.data, weight.scale) if isinstance(weight, ScaledMatrix) else (weight, row)
-    other_numbers, other_scales = (other.data, other.scale) if isinstance(other, ScaledMatrix) else (other, row)
-    assert numbers.dtype == other_numbers.dtype, (numbers.dtype, other_numbers.dtype)
+    whole = _pow2(width)
     _row_product_kernel[(triton.cdiv(rows, ROWS),)](
-        row, row if norm is None else norm.get_parameter("weight"), numbers, other_numbers, scales, other_scales, out,
-        rows, width, eps,
-        NORM=norm is not None, GATED=beside is not None, ADD=add, SCALED=isinstance(weight, ScaledMatrix),
+        row, scale, weight, other, out, rows, width, eps,
+        NORM=norm is not None, GATED=beside is not None, ADD=add,
         ROWS=ROWS, BLOCK=whole if norm is not None else min(BLOCK, whole), num_warps=4, **dependent_launch(row),
     )  # fmt: skip
 
