@@ -115,11 +115,13 @@ def refused(gpu: GpuSpec, precision: str) -> str | None:
 
     Not asked of the kernels themselves: they need Triton, and predictions are for machines without it, too.
     """
-    has_fp8, has = gpu.fp8_tflops is not None, f"this GPU has {gpu.compute_capability}"
-    if precision == "fp8" and not has_fp8:
+    has = f"this GPU has {gpu.compute_capability}"
+    if precision == "fp8" and gpu.fp8_tflops is None:
         return f"tensor cores multiply E4M3 from compute capability 8.9 on; {has}"
-    if precision == "int8" and has_fp8:
-        return f"INT8 is for GPUs without FP8, up to compute capability 8.7; {has}"
+    if precision == "int8" and gpu.capability[0] in (10, 11):
+        return (
+            f"on compute capability 10.x and 11.0 Triton multiplies INT8 by mma.sync, which nobody timed there; {has}"
+        )
     return None
 
 
