@@ -140,9 +140,10 @@ def test_predictions_are_of_the_backend_that_runs_there() -> None:
         by_precision = {one.precision: one for one in predict(gpu, ModelConfig(), Job())}
         assert row["bf16 floor"] == f"{by_precision['bf16'].floor_ms['total']:.1f}"
         assert bool(row["FP8 floor"]) == ("fp8" in by_precision)
-        assert ("measured" in row["bf16 call"]) == (gpu.key in measured)
-        if taken["fp8"] == "no":
-            assert row["FP8 call"] == ""
+        assert ("measured" in row["bf16 `fused`"]) == (gpu.key in measured)
+        assert ("measured" in row["bf16 `cuda_graph`"]) == (gpu.key == "h200")
+        for precision in ("fp8", "int8"):
+            assert bool(row[f"{precision.upper()} `fused`"]) == (taken[precision] != "no")
 
 
 def test_what_it_takes_of_memory_is_what_was_measured() -> None:

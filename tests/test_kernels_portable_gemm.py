@@ -322,6 +322,11 @@ def test_few_rows_do_not_take_the_tallest_tile_and_long_sums_are_split() -> None
     assert tiles.best_tile((9, 0), True, "parts", 560, 2048, 16384, 132).splits > 1
 
 
+def test_int8_is_refused_where_triton_takes_a_slow_instruction_for_it() -> None:
+    for capability in tiles.BLOCK_SHARED:
+        assert (tiles.int8_refusal(capability) is None) == (capability[0] in (8, 9, 12))
+
+
 def test_fp8_is_refused_below_8_9_and_says_why() -> None:
     assert all(tiles.fp8_refusal(one) is None for one in ((8, 9), (9, 0), (12, 0)))
     for capability in ((8, 0), (8, 6), (8, 7)):
@@ -352,6 +357,7 @@ def test_the_variable_forces_the_portable_kernels(hopper: None, monkeypatch: pyt
         assert not kernels_ops.forced_portable()
         origin = kernels_ops.fused_ops(DEVICE).origin
         assert origin["all"] == "Hopper's" and origin["FP8 products"].startswith("CUDA")
+        assert "all" not in kernels_ops.fused_ops(DEVICE, precision="int8").origin, "Hopper's have no INT8"
 
 
 @pytest.mark.parametrize("value", ["hopper", "", "Portable"])

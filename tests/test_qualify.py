@@ -230,7 +230,7 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> Subject:
     monkeypatch.setattr(qualification, "under_test", None)
     monkeypatch.setattr(stages, "check_barrier", lambda device: None)
     monkeypatch.setattr(stages, "barrier_us", lambda device: 1.0)
-    monkeypatch.setattr(stages, "hopper_kernels", lambda device, without: False)
+    monkeypatch.setattr(stages, "hopper_kernels", lambda *given: False)
     monkeypatch.setattr(run, "golden", lambda subject: None)
     monkeypatch.setattr(
         run, "race", lambda *given: Raced({"pytorch": {"total": 2.0}, "other": {"total": 3.0}}, 5, True, "")

@@ -80,6 +80,8 @@ def test_weights_are_rounded_to_every_format_on_every_gpu(tmp_path: Path) -> Non
 def test_the_checked_in_result_has_e4m3_only_where_triton_has_it() -> None:
     rows = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json").rows
     assert {row.target for row in rows if "fp8e4nv" in row.variant} == ALL - {"sm_80", "sm_86", "sm_87"}
+    int8 = {row.target for row in rows if row.kernel == "gemm.kernel.product" and row.variant.endswith(" i8")}
+    assert int8 == ALL - {"sm_100a", "sm_103a", "sm_110a"}, "as `int8_refusal` has it"
     rounded = {row.target for row in rows if row.kernel == "rounding.feedback" and " u8" in row.variant}
     assert rounded == ALL
 

@@ -17,6 +17,9 @@ ALLOWED: dict[str, dict[int, int]] = {
     "denoise.kernel": {80: 8, 86: 24, 87: 168, 90: 48, 100: 56, 103: 56, 110: 280, 120: 16, 121: 56},
     # Of heads of 64 columns, SmolVLA's, tiles that only a measurement chooses
     "attention.vision": {80: 16, 86: 16, 87: 16, 89: 16, 100: 8, 103: 8},
+    # Into INT8, tiles that only a measurement chooses
+    "attention.prefix": {90: 16},
+    "batch.packed": {90: 8},
     # As `denoise.kernel`, in the 128 registers that 16 warps leave. Timed on an H200 with 48 of them at 9.0
     "SmolVLA's denoise.kernel": {
         80: 40,

@@ -58,11 +58,8 @@ def of(*shape: int, dtype: torch.dtype = BF16) -> Tensor:
 
 
 def all_calls(target: Target, chosen: bool = False) -> Calls:
-    """Every variant that the product can launch there at full size; E4M3 where the GPU has it, else int8. chosen: see
-    below.
-    """
-    numbers = E4M3 if tiles.fp8_refusal(target.capability) is None else torch.int8
-    inverses: tuple[Input, ...] = ({}, {"inverse": 30.0, "numbers": numbers})
+    """Every variant that the product can launch there at full size. chosen: see below."""
+    inverses: tuple[Input, ...] = ({}, *({"inverse": 30.0, "numbers": one} for one in eight_bits(target)))
     calls = [
         *_norms(inverses),
         *_attention(target, inverses),
@@ -74,7 +71,13 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         _one_token,
     ]
     calls += [partial(_geglu, one) for one in inverses]
-    return [*calls, *_weights(), *product_calls(target, numbers, chosen)]
+    return [*calls, *_weights(), *product_calls(target, chosen)]
+
+
+def eight_bits(target: Target) -> list[torch.dtype]:
+    """E4M3 and int8, as far as the GPU takes them."""
+    refusals = {E4M3: tiles.fp8_refusal, torch.int8: tiles.int8_refusal}
+    return [numbers for numbers, refusal in refusals.items() if refusal(target.capability) is None]
 
 
 def _marks(input: Input) -> Input:
@@ -86,14 +89,13 @@ def _geglu(input: Input) -> Tensor:
     return activations.geglu(of(PREFIX, 2 * 16384), **input, **_marks(input))
 
 
-def product_calls(target: Target, numbers: torch.dtype, chosen: bool = False) -> Calls:
+def product_calls(target: Target, chosen: bool = False) -> Calls:
     """The products in every tile of the table that this GPU takes; `chosen`: in the tile that it would choose alone.
-    numbers: E4M3 or int8, beside bfloat16.
 
     Splits of the inner axis are two, which stands for more.
     """
     calls: Calls = []
-    for of_numbers in (numbers, BF16):
+    for of_numbers in (*eight_bits(target), BF16):
         for _, epilogue, m, n, k, bias, behind in PRODUCTS:
             if of_numbers == BF16 and (epilogue != "geglu" or behind):
                 continue  # the library's

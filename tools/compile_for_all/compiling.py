@@ -31,7 +31,7 @@ from turbopi.engine import smolvla
 from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import PI05, Expert, Form, WeightNumbers
-from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.models.smolvla.family import BASE
@@ -118,8 +118,8 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
     if target.capability == HOPPER:
         yield from ((f"sm90: {name}", make) for name, make in (machine_code.SHAPES | hopper_backward()).items())
     for suffix in (10, 50):
-        numbers: tuple[WeightNumbers, ...] = ("bf16", "fp8" if fp8_refusal(target.capability) is None else "int8")
-        for weights in numbers:
+        refusals: dict[WeightNumbers, Any] = {"bf16": None, "fp8": fp8_refusal, "int8": int8_refusal}
+        for weights in [one for one, refusal in refusals.items() if not (refusal and refusal(target.capability))]:
             label = weights if weights == "bf16" else weights.upper()
             yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
     yield "SmolVLA's denoise.kernel, H=50, bf16", partial(_smolvla_denoising, target)

@@ -184,26 +184,30 @@ def gpu_refusals() -> list[str]:
 
 
 def gpu_predictions() -> list[str]:
-    """Milliseconds of the main job: floors, and calls of the backend that `auto` takes."""
-    heads = ["ms", "GB/s", "bf16 floor", "bf16 call", "FP8 floor", "FP8 call", "INT8 floor", "INT8 call"]
+    """Milliseconds of the main job: floors, and calls of each backend."""
+    shown = {"bf16": ("cuda_graph", "fused"), "fp8": ("fused",), "int8": ("fused",)}
+    heads = ["ms"]
+    for precision, names in shown.items():
+        label = precision if precision == "bf16" else precision.upper()
+        heads += [f"{label} floor", *(f"{label} `{name}`" for name in names)]
     lines = [f"| {' | '.join(heads)} |", "|---|" + "--:|" * (len(heads) - 1)]
     for gpu in published_gpus().values():
         taken = runs(gpu)
         by_precision = {one.precision: one for one in predict(gpu, ModelConfig(), Job())}
-        cells = [gpu.name, f"{gpu.gb_per_second:g}"]
-        for precision in ("bf16", "fp8", "int8"):
+        cells = [gpu.name]
+        for precision, names in shown.items():
             one = by_precision.get(precision)
             if one is None or taken[precision] == "no":
-                cells += ["", ""]
+                cells += [""] * (1 + len(names))
             else:
-                cells += [f"{one.floor_ms['total']:.1f}", _call(one, taken[precision])]
+                cells += [f"{one.floor_ms['total']:.1f}", *(_call(one, name) for name in names)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
-def _call(prediction: Prediction, taken: str) -> str:
-    """The first call of the backend that is taken; nothing if none is predicted."""
+def _call(prediction: Prediction, backend: str) -> str:
+    """The first call of a backend; nothing if none is predicted."""
     for call in prediction.calls:
-        if f"`{call.backend}`" == taken:
+        if call.backend == backend:
             return call_text(call) + (" (measured)" if prediction.was_measured(call) else "")
     return ""

@@ -98,16 +98,17 @@ class Int8Product(GpuBench):
 
 
 def found_operations(target: Target) -> list[Operation]:
-    """Of one observation; attention of two as well. In bfloat16 and in the eight bits that this GPU has."""
+    """Of one observation; attention of two as well. In bfloat16 and in all eight bits that this GPU takes."""
 
     def found(precision: Precision) -> list[Operation]:
         two = operations(FULL, TWO, precision, "portable")
         return operations(FULL, ONE, precision, "portable") + [one for one in two if "_attention" in one.operation]
 
-    eight = found("fp8")
-    if tiles.fp8_refusal(target.capability) is not None:  # of attention in INT8 there is no bench
-        eight = [replace(one, numbers="int8") for one in eight if one.numbers == "fp8"]
-    return list({(one.key, one.out_fp8): one for one in found("bf16") + eight}.values())
+    fp8 = found("fp8")
+    int8 = [replace(one, numbers="int8") for one in fp8 if one.numbers == "fp8"]  # of attention there is no bench
+    taken = [] if tiles.fp8_refusal(target.capability) is not None else fp8
+    taken += [] if tiles.int8_refusal(target.capability) is not None else int8
+    return list({(one.key, one.out_fp8): one for one in found("bf16") + taken}.values())
 
 
 def tiles_of(one: Operation, target: Target) -> list[Knobs]:

@@ -91,7 +91,7 @@ _SPECS = (
         "fused",
         "turbopi.backends.fused",
         "FusedBackend",
-        "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; FP8 from 8.9 on, INT8 below",
+        "cuda_graph with kernels of our own: NVIDIA GPUs from 8.0; FP8 from 8.9 on, INT8 but on 10.x and 11.0",
         unplanned="turbopi.backends.fused_smolvla:FusedSmolVLABackend",
     ),
     BackendSpec(
@@ -203,8 +203,11 @@ def choose(
         captured = availability("cuda_graph", device) is None
         return "cuda_graph" if captured else "pytorch", "auto: the fastest backend that writes subtasks"
     if precision in TIERS:
-        untried = _untried(device, precision, model) if device.type == "cuda" else None
-        return "fused", f"auto: the fast one of those that run in {precision}" + (f"; {untried}" if untried else "")
+        on_gpu = device.type == "cuda"
+        untried = _untried(device, precision, model) if on_gpu else None
+        slow = on_gpu and precision == "int8" and torch.cuda.get_device_capability(device) == (9, 0)
+        said = [f"the fast one of those that run in {precision}", untried, "fp8 and bf16 are quicker here" * slow]
+        return "fused", f"auto: {'; '.join(one for one in said if one)}"
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []
@@ -298,7 +301,7 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     if precision in TIERS:
         if reason is not None and device.type != "cuda":
             format = format_of(precision)
-            which = "8.0 to 8.7" if format.name == "int8" else "8.9 or newer"
+            which = "8.x, 9.0 or 12.x" if format.name == "int8" else "8.9 or newer"
             reason = (
                 f"{precision} needs an NVIDIA GPU of compute capability {which}; take precision 'bf16', or to judge "
                 f"{format.label} without such a GPU backend 'emulated_{format.name}'"

@@ -1,7 +1,7 @@
 """Backend `fused`: the call of `cuda_graph` with kernels of our own where they beat PyTorch's.
 
 Nothing is compiled by Inductor. On compute capability 9.0 the whole denoising loop, attention of vision and prefix, the
-prefix's feed-forward and many of vision's products are CUDA C++ kernels for it. On other GPUs, and with
+prefix's feed-forward and many of vision's products are CUDA C++ kernels for it. On other GPUs, in INT8 and with
 TURBOPI_KERNELS=portable, they are the kernels of kernels/portable. A model, horizon or loop that the denoising kernels
 don't cover takes the engine's operations one by one. `describe()` says what runs.
 """
@@ -92,14 +92,12 @@ class FusedBackend(CudaGraphBackend):
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
         if precision not in TIERS or importlib.util.find_spec("triton") is None:  # which `unavailable` tells
             return None
-        from turbopi.kernels.ops import forced_portable
         from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
         capability = torch.cuda.get_device_capability(device)
         if precision == "int8":
             reason = int8_refusal(capability)
-            measured_here = capability == (9, 0) and forced_portable()
-            return None if reason is None or measured_here else f"{reason}; use 'fp8'"
+            return None if reason is None else f"{reason}; use 'fp8'"
         reason = fp8_refusal(capability)
         return None if reason is None else f"{reason}; use 'bf16', or 'int8'"
 
@@ -202,8 +200,9 @@ class FusedBackend(CudaGraphBackend):
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
 
-        self._on_hopper, self._tiles = hopper_kernels(self.device, self._without), tiles_of(self.device)
-        return fused_ops(self.device, self._tiles.table, self._without)
+        self._tiles = tiles_of(self.device)
+        self._on_hopper = hopper_kernels(self.device, self._without, self.precision)
+        return fused_ops(self.device, self._tiles.table, self._without, self.precision)
 
     @property
     def _times_by_token(self) -> bool:

@@ -148,7 +148,8 @@ def file_of(device: torch.device, precision: Precision, model: Network) -> Path:
 
 def about(device: torch.device, precision: Precision, model: Network) -> dict[str, Any]:
     gpu = torch.cuda.get_device_properties(device)
-    on_hopper = (gpu.major, gpu.minor) == (9, 0) and os.environ.get("TURBOPI_KERNELS") != "portable"
+    forced = os.environ.get("TURBOPI_KERNELS") == "portable"
+    on_hopper = (gpu.major, gpu.minor) == (9, 0) and not forced and precision != "int8"
     return {
         "gpu": gpu.name,
         "compute_capability": f"{gpu.major}.{gpu.minor}",

@@ -1,14 +1,18 @@
 """How long a call may take on a GPU that nobody measured: predictions, from published numbers and measured calls.
 
-The floor is `work.py`'s counts at the published rates. A call takes longer, and by how much depends on the program. Two
-ways to carry that over from a GPU on which the same backend was measured give a range:
+The floor is `work.py`'s counts at the published rates. Of a measured call each stage's time is taken apart:
 
-    what was lost beyond the floor takes as long there     floor + (measured - its floor)
-    the ratio to the floor is the same there               floor * (measured / its floor)
+    took = delays + ratio * floor        elsewhere: delays * CLOCKS + ratio * its floor
 
-each stage on its own, a denoising step's loss for each step, and the host's part of a call as it was measured. Launches
-and barriers cost about the same on every GPU, badly used bandwidth and matrix units cost in proportion; no GPU's loss
-is all of one kind.
+    delays  launches, barriers, waiting: as many clock cycles elsewhere, each step's again, the host's part as measured
+    ratio   of vision and prefix what three more observations take in a batch, over their floor: launches stay as many.
+            At the lower end a large matmul reaches the published rate, at the higher end REACHED of it as on Hopper.
+            In 8 bits batches of the portable kernels weren't measured: at the higher end their delays are bf16's
+            and all else is ratio, as on Hopper; at the lower end the ratio is bf16's.
+            Of denoising, which reads weights: 1, or as a large copy reaches on Hopper
+
+docs/dev/performance.md works through an RTX 4090. What chunks longer than the measured call's add is what it was with
+the same kernels in other precisions.
 
 Chunks longer than a denoising kernel takes are denoised by operations, which nobody measured for one observation: at
 the higher end their denoising takes longer than measured as their actions are more than the kernel takes.
@@ -28,6 +32,9 @@ PRECISIONS = ("bf16", "fp8", "int8")
 STAGES = ("vision", "prefix", "denoise")
 MOST_TOKENS: dict[Kernels, int] = {"hopper": 56, "portable": 64}  # that the denoising kernels take: their MAX_SUFFIX
 _BYTES = {"bf16": 2, "fp8": 1, "int8": 1}
+# Of the published rates, by a large bf16 matmul and a large copy on the H200: h200_2026-11-24_portable_kernels.json
+REACHED = {"matmul": 0.78, "copy": 0.88}
+CLOCKS = (0.75, 1.5)  # of a cycle of Hopper's 1.98 GHz: published clocks are 1.3 GHz (Jetson AGX Orin) to 2.6 (GeForce)
 
 
 class PredictedCall(Struct, frozen=True, kw_only=True):
@@ -83,26 +90,84 @@ def published_floors(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str
 def predicted_call(gpu: GpuSpec, config: ModelConfig, job: Job, measured: MeasuredCall) -> PredictedCall:
     """What a call would take on the GPU, going by one that was measured, of the full-size model, elsewhere."""
     there = published_floors(gpu, config, job, measured.precision)
-    here = published_floors(find_gpu(measured.gpu), ModelConfig(), measured.job, measured.precision)
-    took = {name: times.p50 for name, times in measured.milliseconds.items()}
-    host = took["total"] - sum(took[stage] for stage in STAGES)
-    times = {"denoise": job.steps / measured.job.steps}  # a loss there is one of each step
-    added = host + sum(there[stage] + (took[stage] - here[stage]) * times.get(stage, 1.0) for stage in STAGES)
-    ratios = {stage: took[stage] / here[stage] for stage in STAGES}
-    scaled = host + sum(there[stage] * ratios[stage] for stage in STAGES)
+    here, took = _floors_and_times(measured)
+    low = high = took["total"] - sum(took[stage] for stage in STAGES)
+    clocks = (1.0,) if gpu.key == measured.gpu else CLOCKS
+    for stage, ratios in _ratios(measured).items():
+        denoises = stage == "denoise"
+        again = job.steps / measured.job.steps if denoises else 1.0
+        ends = [
+            (took[stage] + more - ratio * here[stage]) * again * clock + ratio * there[stage]
+            for more in (_grown(measured, job) if denoises else [0.0])
+            for ratio in (min(one, took[stage] / here[stage]) for one in ratios)
+            for clock in clocks
+        ]
+        low, high = low + min(ends), high + max(ends)
     most = MOST_TOKENS.get(measured.kernels, job.horizon)
     if measured.job.horizon <= most < job.horizon:
         alike = published_floors(gpu, config, replace(job, horizon=measured.job.horizon), measured.precision)["denoise"]
-        scaled += max(0.0, alike * job.horizon / most - there["denoise"]) * ratios["denoise"]
+        high += max(0.0, alike * job.horizon / most - there["denoise"]) * took["denoise"] / here["denoise"]
     return PredictedCall(
         backend=measured.backend,
         kernels=measured.kernels,
-        low_ms=min(added, scaled),
-        high_ms=max(added, scaled),
+        low_ms=low,
+        high_ms=high,
         measured_on=measured.gpu,
         measured_job=measured.job,
         source=measured.source,
     )
+
+
+def _floors_and_times(call: MeasuredCall) -> tuple[dict[str, float], dict[str, float]]:
+    floors = published_floors(find_gpu(call.gpu), ModelConfig(), call.job, call.precision)
+    return floors, {name: times.p50 for name, times in call.milliseconds.items()}
+
+
+def _grown(measured: MeasuredCall, job: Job) -> list[float]:
+    """Milliseconds that longer chunks than the measured call's add to denoising: with its kernels in each precision."""
+    same, short = (measured.gpu, measured.kernels, measured.job.batch), measured.job.horizon
+    calls = [one for one in measured_calls() if (one.gpu, one.kernels, one.job.batch) == same]
+    took = {(one.precision, one.job.horizon): one.milliseconds["denoise"].p50 for one in calls}
+    longer = min((horizon for _, horizon in took if horizon > short), default=short)
+    found = [
+        took[name, longer] - took[name, short] for name, horizon in took if horizon == longer and (name, short) in took
+    ]
+    if job.horizon <= short or not found:
+        return [0.0]
+    return found if job.horizon >= longer else [0.0, *found]
+
+
+def _ratios(measured: MeasuredCall) -> dict[str, tuple[float, float]]:
+    """Stage -> what a millisecond of its floor takes, delays apart, at least and at most."""
+    found = {"denoise": (1.0, 1 / REACHED["copy"])}
+    here, took = _floors_and_times(measured)
+    for stage in ("vision", "prefix"):
+        ratio = _ratio(stage, measured.kernels, measured.precision)
+        if ratio is not None:
+            found[stage] = (ratio * REACHED["matmul"], ratio)
+            continue
+        library = _ratio(stage, "pytorch", "bf16")  # whose matmuls portable bf16 has, too
+        assert library is not None
+        kind = replace(measured, precision="bf16")
+        alike = nearest([one for one in measured_calls() if _kind(one) == _kind(kind)], measured.job)
+        floors, times = _floors_and_times(alike)
+        most = (took[stage] - times[stage] + library * floors[stage]) / here[stage]  # bf16: that is `library`
+        found[stage] = (library * REACHED["matmul"], most)
+    return {stage: found[stage] for stage in STAGES}
+
+
+def _ratio(stage: str, kernels: str, precision: str) -> float | None:
+    """Of vision or prefix by batches of one and four observations; None where none were measured."""
+    calls = {one.job: one for one in measured_calls() if _kind(one)[:3] == ("h200", kernels, precision)}
+    one, four = calls.get(Job()), calls.get(Job(batch=4))
+    if one is None or four is None:
+        return None
+    (floor, took), (floor_of_four, took_of_four) = _floors_and_times(one), _floors_and_times(four)
+    return (took_of_four[stage] - took[stage]) / (floor_of_four[stage] - floor[stage])
+
+
+def _kind(call: MeasuredCall) -> tuple[str, str, str, int]:
+    return call.gpu, call.kernels, call.precision, call.job.batch
 
 
 def runs_on(kernels: Kernels, gpu: GpuSpec) -> bool:
@@ -115,11 +180,13 @@ def refused(gpu: GpuSpec, precision: str) -> str | None:
 
     Not asked of the kernels themselves: they need Triton, and predictions are for machines without it, too.
     """
-    has_fp8, has = gpu.fp8_tflops is not None, f"this GPU has {gpu.compute_capability}"
-    if precision == "fp8" and not has_fp8:
+    has = f"this GPU has {gpu.compute_capability}"
+    if precision == "fp8" and gpu.fp8_tflops is None:
         return f"tensor cores multiply E4M3 from compute capability 8.9 on; {has}"
-    if precision == "int8" and has_fp8:
-        return f"INT8 is for GPUs without FP8, up to compute capability 8.7; {has}"
+    if precision == "int8" and gpu.capability[0] in (10, 11):
+        return (
+            f"on compute capability 10.x and 11.0 Triton multiplies INT8 by mma.sync, which nobody timed there; {has}"
+        )
     return None
 
 

@@ -35,7 +35,7 @@ def calibrate(
     precision: Annotated[
         str,
         typer.Option(
-            "--precision", metavar="fp8|int8", help="int8 is for GPUs without FP8: compute capability 8.0-8.7."
+            "--precision", metavar="fp8|int8", help="int8: for compute capability 8.0-8.7; also for 8.9, 9.0, 12.x."
         ),
     ] = "fp8",
     observations: Annotated[

@@ -90,8 +90,8 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
         f"These are predictions: nothing was run for them{', but for those with a star' if measured else ''}.",
         *([f"{MEASURED} this call was measured on that GPU"] if measured else []),
         "floor: the counted work at NVIDIA's published rates",
-        "call: the floor and what the backend lost beyond its floor on the GPU where it",
-        "      was measured, as the same time at one end, as the same ratio at the other",
+        "call: as on the GPU where the backend was measured: its delays by the clock, its",
+        "      matmuls by the published rates, or by the share of them that Hopper reaches",
     ]
     calls = {(call.backend, call.kernels, call.measured_on, call.source) for one in predictions for call in one.calls}
     lines += [f"{name}, {KERNELS[kernels]}, as on {gpu}: {source}" for name, kernels, gpu, source in sorted(calls)]

@@ -45,12 +45,14 @@ def forced_portable() -> bool:
     return value == "portable"
 
 
-def hopper_kernels(device: torch.device, without: Collection[str] = ()) -> bool:
-    """Whether the kernels for compute capability 9.0 run on this device. `without` "sm90" they don't."""
-    return capability(device) == (9, 0) and not forced_portable() and "sm90" not in without
+def hopper_kernels(device: torch.device, without: Collection[str] = (), precision: str = "bf16") -> bool:
+    """Whether the kernels for compute capability 9.0 run on this device. `without` "sm90" and in "int8" no."""
+    return capability(device) == (9, 0) and not (forced_portable() or "sm90" in without or precision == "int8")
 
 
-def fused_ops(device: torch.device, tiles: TileTable = NO_TILES, without: Collection[str] = ()) -> Ops:
+def fused_ops(
+    device: torch.device, tiles: TileTable = NO_TILES, without: Collection[str] = (), precision: str = "bf16"
+) -> Ops:
     """Activations are bfloat16; between a `ScaledMatrix` and the operation before it E4M3 (from compute capability 8.9)
     or int8. `tiles` were measured on this GPU. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor
     "portable".
@@ -58,7 +60,7 @@ def fused_ops(device: torch.device, tiles: TileTable = NO_TILES, without: Collec
     without  names of operations that failed their self-test on this GPU: PyTorch's take their place; "sm90": all of
              Hopper's
     """
-    ops = ops_of("hopper" if hopper_kernels(device, without) else "portable", device, tiles)
+    ops = ops_of("hopper" if hopper_kernels(device, without, precision) else "portable", device, tiles)
     instead: dict[str, Any] = {one.name: getattr(BESIDE, one.name) for one in fields(Ops) if one.name in without}
     if not instead:
         return ops

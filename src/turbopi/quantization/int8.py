@@ -1,4 +1,4 @@
-"""Numbers of eight bits: whole numbers from -127 to 127, for GPUs whose tensor cores don't multiply E4M3.
+"""Numbers of eight bits: whole numbers from -127 to 127, for GPUs whose tensor cores multiply them fastest.
 
 As in fp8.py a matrix has one scale an output channel and an activation one a site: x ≈ int8 * scale. Products of two
 such numbers are added up as int32, exactly; the sum becomes float32 once, times both scales.
