@@ -1,6 +1,6 @@
 """Compile every kernel of Turbo-Pi for every GPU of compute capability 8.0 and newer, without a GPU.
 
-    PYTHONPATH=src:tools python -m compile_for_all --json benchmarks/results/compiled_for_all.json
+    PYTHONPATH=src:tools python -m compile_for_all --json benchmarks/results/compiled_for_all.json.xz
     PYTHONPATH=src:tools python -m compile_for_all --targets 89,120 --kernels gemm
     PYTHONPATH=src:tools python -m compile_for_all --targets 90 --kernels "sm90: " --into FILE
 
@@ -38,7 +38,7 @@ def main() -> int:
     given = parser.parse_args()
     os.environ.pop("TRITON_INTERPRET", None)
     from compile_for_all.compiling import compile_target, versions
-    from compile_for_all.document import CompiledForAll, read_compiled, replaced, written
+    from compile_for_all.document import CompiledForAll, read_compiled, replaced, write_compiled
     from compile_for_all.targets import TARGETS
 
     numbers = None if given.targets is None else given.targets.split(",")
@@ -51,10 +51,10 @@ def main() -> int:
     show(rows, Console(width=WIDTH))
     now = CompiledForAll(date.today().isoformat(), versions(), rows)
     if given.json is not None:
-        given.json.write_text(written(now))
+        write_compiled(given.json, now)
     if given.into is not None:
-        given.into.write_text(
-            written(replaced(read_compiled(given.into), now, {one.arch for one in wanted}, given.kernels))
+        write_compiled(
+            given.into, replaced(read_compiled(given.into), now, {one.arch for one in wanted}, given.kernels)
         )
     return 1 if any(row.problem for row in rows) else 0
 

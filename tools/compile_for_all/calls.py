@@ -276,6 +276,9 @@ def _smolvla(target: Target) -> Calls:
 
 
 def _one_token() -> None:
+    def int8(rows: int, columns: int) -> token.Int8Rows:
+        return token.Int8Rows(of(rows, columns // 4, dtype=torch.int32), of(rows, dtype=F32))
+
     """Of Pi0-FAST: a layer behind three images and a prompt, and the head."""
     norm, row, (heads, dim, width, hidden, places) = (
         nn.RMSNorm(2048, dtype=BF16),
@@ -292,12 +295,14 @@ def _one_token() -> None:
     )
     table, logits = of(257152, width), of(1, 257152, dtype=F32)
     token.embed_id(one, table, row)
-    token.row_product(row, of(2560, width), qkv, norm=norm, eps=1e-6)
+    for weight in (of, int8):
+        token.row_product(row, weight(2560, width), qkv, norm=norm, eps=1e-6)
+        token.row_product(attended, weight(width, heads * dim), row, add=True)
+        up = weight(hidden, width)
+        token.row_product(row, weight(hidden, width), of(hidden, dtype=F32), norm=norm, eps=1e-6, beside=up)
+        token.row_product(of(hidden, dtype=F32), weight(width, hidden), row, add=True)
     token.attend_places(qkv, (cos, cos), cache, cache, of(1, places, dtype=torch.uint8), one, one, shares)
     token.join_shares(shares, attended)
-    token.row_product(attended, of(width, heads * dim), row, add=True)
-    token.row_product(row, of(hidden, width), of(hidden, dtype=F32), norm=norm, eps=1e-6, beside=of(hidden, width))
-    token.row_product(of(hidden, dtype=F32), of(width, hidden), row, add=True)
     best, where = of(126, dtype=F32), of(126, dtype=torch.int32)
     token.choose(logits, best, where, one, many, one, one, one, of(2, dtype=torch.int64), room)
 

@@ -1,12 +1,13 @@
 """What `python -m compile_for_all --json` writes, and reads again."""
 
 import json
+import lzma
 from pathlib import Path
 
 from msgspec import Struct, structs
 
 from turbopi.support.errors import ConfigError
-from turbopi.support.reading import plain_document, read_document
+from turbopi.support.reading import as_document, plain_document, read_document
 
 
 class Compiled(Struct, frozen=True):
@@ -49,8 +50,11 @@ class _File(Struct, frozen=True):
 
 
 def read_compiled(file: Path) -> CompiledForAll:
-    """Raises ConfigError for another file."""
-    document = read_document(file, _File, ConfigError)
+    """Raises ConfigError, a ValueError, for another file. One that ends in .xz is packed."""
+    if file.suffix == ".xz":
+        document = as_document(json.loads(lzma.decompress(file.read_bytes())), _File, str(file))
+    else:
+        document = read_document(file, _File, ConfigError)
     rows = []
     for one in document.kernels:
         for used, targets in one.found.items():
@@ -91,3 +95,9 @@ def written(document: CompiledForAll) -> str:
     lines = ",\n".join(f"  {json.dumps(plain_document(one))}" for one in kernels.values())
     empty = json.dumps(plain_document(_File(document.date, document.versions, [])), indent=1)
     return empty.replace('"kernels": []', f'"kernels": [\n{lines}\n ]') + "\n"
+
+
+def write_compiled(file: Path, result: CompiledForAll) -> None:
+    """As `read_compiled` reads it."""
+    content = written(result).encode()
+    file.write_bytes(lzma.compress(content, preset=9 | lzma.PRESET_EXTREME) if file.suffix == ".xz" else content)

@@ -32,12 +32,12 @@ from turbopi.support.reading import read_document
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TESTED = "*_gpu_check.json"
-COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json*"  # the second of an H100 or H200; its newest counts
+COMPILED, AS_PTX = "compiled_for_all.json.xz", "h?00_*_ptx.json*"  # the second of an H100 or H200; its newest counts
 DEVICE = torch.device("cuda", 0)
 RACED = ("fused", "cuda_graph")
 QUALIFIED = " *"  # behind what `auto` takes where it isn't qualified: then it may be `fused`
 REPORTS = "qualified/*.json"  # as users' machines wrote them
-TIERS: tuple[Precision, ...] = tuple(one for one in backends.PRECISIONS if one != "f32" and not one.endswith("-mlp"))
+TIERS: tuple[Precision, ...] = ("bf16", "fp8", "int8")
 
 
 @contextmanager
