@@ -145,11 +145,12 @@ class PromptTokenizer:
         labels: bool = False,
         write: Write | None = None,
         tagged: bool = False,
+        cut: bool = True,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
         `as_is`, `labels`, `write`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
-        `truncation_side` says; a warning is logged once for each. `tagged`: it is an ObservationError instead.
+        `truncation_side` says; a warning is logged once for each. `tagged`, not `cut`: an ObservationError instead.
         """
         ids = self.encode(prompt, state, as_is=as_is, labels=labels, write=write)
         count = min(len(ids), max_tokens)
@@ -157,6 +158,10 @@ class PromptTokenizer:
             raise ObservationError(
                 f"the prompt and guidance's tag take {len(ids)} tokens, but the model reads {max_tokens}: the tag, or "
                 f"the state behind it, would be cut. Shorten the prompt: {prompt[:200]!r}"
+            )
+        if count < len(ids) and not cut:
+            raise ObservationError(
+                f"the prompt takes {len(ids)} tokens; expected at most {max_tokens}: it is never cut"
             )
         if count < len(ids):
             left = getattr(self.encoder, "truncation_side", "right") == "left"
