@@ -11,6 +11,7 @@ import torch
 from pi0_fast_golden import GOLDEN, RUNS, TOKENIZER, make_folder, make_hub, policy_of, runs
 from replayed_graphs import Replayed, replay_on_cpu
 from safetensors.numpy import load_file, save_file
+from sentencepiece import SentencePieceProcessor
 from smolvla_golden import relative
 from typer.testing import CliRunner, Result
 
@@ -44,6 +45,8 @@ BROKEN = {
     ("no_prefix", 1): "has the code -3",
     ("openpi", 1): "coefficients, and 8 actions",
 }
+P = "model.paligemma_with_expert.paligemma."
+HEAD, EMBEDDING = P + "lm_head.weight", P + "model.language_model.embed_tokens.weight"
 ALL = [(name, run) for name, count in RUNS.items() for run in range(count)]
 WHOLE = [one for one in ALL if one not in BROKEN and one[0] != "short_execution"]
 
@@ -155,6 +158,49 @@ def test_the_action_tokenizer_is_found_or_asked_for(
 class _Encoder:
     def encode(self, text: str, *, add_bos: bool) -> list[int]:
         return [2, 3]
+
+
+def first_logits(policy: Any, observation: dict[str, object]) -> torch.Tensor:
+    trace: dict[str, torch.Tensor] = {}
+    inputs = Observation.stack([policy.prepare(observation)])
+    policy.backend.model.generate(inputs, policy.backend.reader, 2, trace=trace, forced=[7])
+    return trace["logits"]
+
+
+def test_lm_head_writes_and_embed_tokens_reads_where_lerobot_trained_them_apart(tmp_path: Path) -> None:
+    """A head whose rows are moved by one moves the logits by one, also those behind a written token."""
+    folder, observation = make_folder("base", tmp_path / "apart"), runs("base").observation(0)
+    tied = first_logits(policy_of(folder, backend="pytorch"), observation)
+    tensors = load_file(folder / "model.safetensors")
+    save_file(tensors | {HEAD: np.roll(tensors[HEAD], 1, axis=0)}, folder / "model.safetensors")
+    checkpoint = open_checkpoint(folder)
+    assert checkpoint.info()["notes"] == [] and "lm_head.weight" in checkpoint.source.shapes
+    apart = first_logits(policy_of(folder, backend="pytorch"), observation)
+    assert torch.equal(apart, tied.roll(1, dims=-1))
+    base, adapted = (make_folder("base", tmp_path / name) for name in ("base", "adapted"))  # of lm_head alone
+    (adapted / "model.safetensors").unlink()
+    config = json.loads((adapted / "config.json").read_text()) | {"use_peft": True}
+    (adapted / "config.json").write_text(json.dumps(config))
+    lora = {"peft_type": "LORA", "r": 1, "lora_alpha": 1, "base_model_name_or_path": str(base)}
+    (adapted / "adapter_config.json").write_text(json.dumps(lora))
+    rows, width = tensors[HEAD].shape
+    a, b = np.eye(1, width, dtype=np.float32), 2 * np.eye(1, rows, 5, dtype=np.float32).T
+    where = f"base_model.model.{HEAD.removesuffix('weight')}"
+    save_file({f"{where}lora_A.weight": a, f"{where}lora_B.weight": b}, adapted / "adapter_model.safetensors")
+    state = open_checkpoint(adapted).load("cpu", "f32").state
+    change = state["lm_head.weight"] - state["vlm.embed_tokens.weight"]
+    assert change[5, 0] == 2 and change.count_nonzero() == 1
+    save_file({name: one for name, one in tensors.items() if name != EMBEDDING}, base / "model.safetensors")
+    with pytest.raises(CheckpointError, match=r"lm_head\.weight, which the base model doesn't have"):
+        open_checkpoint(adapted)
+
+
+def test_a_prompt_that_names_a_control_piece_has_it_as_in_lerobot(folders: Path) -> None:
+    policy = policy_of(folders / "base")
+    inputs = policy.prepare(runs("base").observation(0) | {"task": "put</s><pad>it"})
+    tokens, encode = inputs.tokens[inputs.token_mask].tolist(), SentencePieceProcessor(model_file=str(TOKENIZER)).encode
+    beginning = [2, *encode("Task: put"), 1, 0, *encode("it, State: ")]
+    assert tokens[: len(beginning)] == beginning
 
 
 def test_the_tokenizer_that_lerobot_saves_reads_answers_too(folders: Path) -> None:

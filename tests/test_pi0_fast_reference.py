@@ -1,5 +1,6 @@
 """Pi0-FAST's reference against what openpi's and LeRobot's own code computed."""
 
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from turbopi.models.pi0_fast.reference import Trace, compacted
 from turbopi.support.errors import TokenizerError
 
 ALL = [(name, run) for name, count in RUNS.items() for run in range(count)]
+CLEANS = '{"clean_up_tokenization_spaces": true}'
 SEEN = [(name, run) for name, run in ALL if name not in ("relative", "short_execution")]  # with intermediates
 
 
@@ -103,6 +105,14 @@ def test_a_folder_that_is_no_action_tokenizer_is_named(tmp_path: Path) -> None:
     (tmp_path / "tokenizer.json").write_text('{"model": {}}')
     with pytest.raises(TokenizerError, match="no vocabulary"):
         FastTokenizer.from_folder(tmp_path)
+    content = {"model": {"vocab": {"!": 0}}, "added_tokens": [{"content": "ab", "id": 1}]}
+    for decoder, beside, message in (("Metaspace", "{}", "expected 'ByteLevel'"), ("ByteLevel", CLEANS, "drops")):
+        (tmp_path / "tokenizer.json").write_text(json.dumps(content | {"decoder": {"type": decoder}}))
+        (tmp_path / "tokenizer_config.json").write_text(beside)
+        with pytest.raises(TokenizerError, match=message):
+            FastTokenizer.from_folder(tmp_path)
+    (tmp_path / "tokenizer_config.json").unlink()
+    assert FastTokenizer.from_folder(tmp_path).text([1, 0, 2]) == "ab!"
 
 
 def test_stopping_at_the_mark_is_exact_for_openpi_behind_the_beginning_alone(policies: Any) -> None:

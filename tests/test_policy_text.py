@@ -16,6 +16,7 @@ from lerobot_golden import GoldenCase
 from pi0_fast_golden import TOKENIZER
 from replayed_graphs import Replayed, replay_on_cpu
 from safetensors.numpy import load_file, save_file
+from sentencepiece import SentencePieceProcessor
 from smolvla_golden import GoldenRuns, relative
 from typer.testing import CliRunner
 
@@ -27,8 +28,8 @@ from turbopi.config import TextConfig
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.text import never_written
 from turbopi.policy.text import SubtaskHistory
-from turbopi.preprocess.text_prompts import text_ids
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.text_prompts import text_ids, text_of
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, PromptTokenizer
 from turbopi.realtime import RealTimeClient
 from turbopi.realtime.wire import pack, unpack
 from turbopi.serve import running
@@ -122,6 +123,18 @@ def test_a_given_subtask_is_acted_on_and_leaves_the_held_one(policies: dict[str,
     other = policy.infer(golden.observation(1), noise=golden.noise, subtask="wave")
     assert other["subtask"] == "wave" and relative(other["actions"], golden.actions(1)) > 1e-3
     assert policy.infer(golden.observation(1))["subtask"] == ("open the drawer" if name == "subtasks" else "grasp it")
+
+
+def test_bytes_that_are_no_text_together_are_replaced_each_as_in_transformers() -> None:
+    encoder = SentencePieceProcessor(model_file=str(TOKENIZER))
+    ids = [encoder.piece_to_id(f"<0x{byte:02X}>") for byte in "ü".encode() + b"\xffo"]
+    tokenizer = PromptTokenizer(encoder, vocab_size=2200)
+    assert text_of(tokenizer, ids[:2]) == "ü" and text_of(tokenizer, [*ids, 2000]) == "\N{REPLACEMENT CHARACTER}" * 4
+
+
+def test_a_subtask_too_long_for_the_prompt_is_refused_not_cut(policies: dict[str, UnifiedPolicy]) -> None:
+    with pytest.raises(ObservationError, match="it is never cut"):
+        policies["subtasks"].infer(runs("subtasks").observation(0), subtask="ü" * 300)
 
 
 def test_vision_runs_once_a_chunk(policies: dict[str, UnifiedPolicy], monkeypatch: pytest.MonkeyPatch) -> None:

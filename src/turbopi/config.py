@@ -233,6 +233,7 @@ class Pi0FastConfig:
     max_decoding_steps  tokens of an answer at most
     skipped_ids         at the end of the vocabulary, which no action token uses (fast_skip_tokens)
     checks_prefix       LeRobot's validate_action_token_prefix
+    tied_head           the embedding table gives the logits, too; LeRobot trains the two apart
     broken_answers      "refuse": an ActionError; "owners": what the owner's own code makes of them; "unread": answers
                         are as long as they may be, and stand-in actions are made of their ids, for measurements
     """
@@ -247,6 +248,7 @@ class Pi0FastConfig:
     max_decoding_steps: int = 256
     skipped_ids: int = 128
     checks_prefix: bool = True
+    tied_head: bool = True
     broken_answers: BrokenAnswers = "refuse"
     rms_norm_eps: float = 1e-6
     rope_base: float = 10_000.0

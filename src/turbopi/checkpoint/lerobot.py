@@ -395,7 +395,7 @@ class LeRobotFolder:
         if mask is not None and self.state_dim < self.action_dim:
             raise CheckpointError(
                 f"{self.folder / POSTPROCESSOR} adds the state to {self.action_dim} relative actions, but the state "
-                f"has {self.state_dim} values; LeRobot can't run it either"
+                f"has {self.state_dim} values; LeRobot fails there, or adds its only value to every action"
             )
         options: dict[str, object] = {
             "image_keys": cameras,

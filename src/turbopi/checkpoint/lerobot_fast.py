@@ -7,6 +7,7 @@ from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import PI0_FAST, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION_TOKENIZER
 from turbopi.checkpoint.names import FastNames, Names
+from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.config import LIMITS, Pi0FastConfig, PolicyConfig
 from turbopi.models import FAMILIES
 from turbopi.support.hub_cache import hub_folder
@@ -23,7 +24,7 @@ class FastFolder(LeRobotFolder):
 
     @classmethod
     def names(cls, folder: Path) -> Names:
-        return FastNames()
+        return FastNames(apart=is_adapter(folder))
 
     def _described(self) -> PolicyConfig:
         config = self.config

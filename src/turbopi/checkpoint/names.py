@@ -11,7 +11,7 @@ _PALIGEMMA = "paligemma_with_expert.paligemma."
 _VISION = _PALIGEMMA + "model.vision_tower.vision_model."
 _LANGUAGE = _PALIGEMMA + "model.language_model."
 
-EMBEDDING = "vlm.embed_tokens.weight"
+EMBEDDING, HEAD = "vlm.embed_tokens.weight", "lm_head.weight"
 TIED_HEAD = _PALIGEMMA + "lm_head.weight"  # openpi stores the tied embedding once, under the head's name
 TIED_EMBEDDING = _LANGUAGE + "embed_tokens.weight"
 _OF_TRAINING = ("value_head.", "noise_head.")  # RLinf's critic and exploration: what it deploys reads neither
@@ -90,12 +90,12 @@ class Names(Protocol):
 class PiNames:
     """Pi0's and Pi0.5's, openpi's and LeRobot's.
 
-    embedding    which of the tied two LeRobot computes with
     trains_head  LeRobot trains lm_head beside the embedding
+    head         its canonical name, where it is a parameter of the model
     """
 
-    embedding: str = TIED_EMBEDDING
     trains_head: bool = False
+    head: str | None = None
 
     def canonical(self, key: str) -> str | None:
         key = current_name(key)
@@ -112,6 +112,12 @@ class TextNames(PiNames):
 
 
 class FastNames(PiNames):
-    """LeRobot's Pi0-FAST: where the head and the embedding are both stored, LeRobot computes with the head."""
+    """LeRobot's Pi0-FAST: embed_tokens embeds, lm_head writes. A file with one of the two means both by it.
 
-    embedding = TIED_HEAD
+    apart  two equal ones are two parameters, too: an adapter may change one alone
+    """
+
+    head = HEAD
+
+    def __init__(self, *, apart: bool = False) -> None:
+        self.apart = apart

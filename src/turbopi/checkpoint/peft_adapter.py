@@ -24,7 +24,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from turbopi.checkpoint.names import TIED_HEAD, current_name
+from turbopi.checkpoint.names import EMBEDDING, TIED_HEAD, current_name
 from turbopi.checkpoint.source import Piece, listing
 from turbopi.checkpoint.torch_files import ITEMSIZE, Stored, TorchSource, read_header, read_tensor
 from turbopi.checkpoint.torch_files import WEIGHTS as MODEL
@@ -153,10 +153,13 @@ class PeftSource:
 
     def _target(self, key: str, stored: Stored) -> str:
         """The canonical name of the parameter at `key`; "" for heads, which no action is computed from."""
-        name = None if current_name(key) == TIED_HEAD else self._base.names.canonical(key)
+        names, shapes = self._base.names, self._base.shapes
+        head = getattr(names, "head", None)
+        name = head if current_name(key) == TIED_HEAD else names.canonical(key)
         if name is None:
             return ""
-        if name not in self._base.shapes:
+        alone = name != EMBEDDING or head is None or head in shapes  # else the base's table is its head, too
+        if name not in shapes or not alone:
             raise CheckpointError(f"{self._where}: {stored.key} is for {key}, which the base model doesn't have")
         return name
 

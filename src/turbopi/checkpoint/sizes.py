@@ -5,6 +5,7 @@ from dataclasses import replace
 from math import isqrt
 from typing import Any, get_args
 
+from turbopi.checkpoint.names import HEAD
 from turbopi.checkpoint.source import Shape, WeightSource, listing
 from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, Pi0FastConfig, PiKind, VisionConfig
 from turbopi.models import FAMILIES
@@ -98,6 +99,8 @@ def model_sizes(
                 "action_dim": shapes["action_in_proj.weight"][1],
                 "kind": detect_kind(source, where),
             }
+        else:
+            found["tied_head"] = HEAD not in shapes
     except (IndexError, ZeroDivisionError, ValueError) as error:
         raise CheckpointError(f"{where}: tensors have impossible shapes ({error})") from error
     vision = replace(vision, num_heads=_vision_heads(source, vision.width, base.vision, vision_heads, where))

@@ -17,8 +17,10 @@ from torch import Tensor
 
 from turbopi.checkpoint.names import (
     EMBEDDING,
+    HEAD,
     TIED_EMBEDDING,
     TIED_HEAD,
+    FastNames,
     Names,
     PiNames,
     common_prefix,
@@ -129,7 +131,7 @@ class TorchSource:
     def _tied(self, heads: dict[str, Stored], folder: Path) -> Stored:
         """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values.
 
-        LeRobot (from 0.5) trains both, untied, and computes with the embedding alone.
+        LeRobot (from 0.5) trains both, untied; where no token is written, it computes with the embedding alone.
         """
         if len(heads) == 1:
             return next(iter(heads.values()))
@@ -143,16 +145,16 @@ class TorchSource:
                 f"{folder}: {head.key} and {embedding.key} are tied in the model but differ in the file, so it's "
                 "unclear which one the model was trained with. Remove the wrong one from the file"
             )
-        # a look at the first rows will do: weight decay changes all of them
-        taken = head if getattr(self.names, "embedding", TIED_EMBEDDING) == TIED_HEAD else embedding
-        if taken is embedding and self.format == "lerobot":
+        if isinstance(self.names, FastNames):
+            if self.names.apart or not _equal(read_tensor(head), read_tensor(embedding)):
+                self._stored[HEAD] = head
+            return embedding
+        if self.format == "lerobot":
             self.head = head
-        if apart:
-            return taken
-        if not torch.equal(read_tensor(head)[:1024], read_tensor(embedding)[:1024]):
-            name = "lm_head" if taken is head else "embed_tokens"
-            self.notes.append(f"lm_head and embed_tokens differ: prompts are embedded by {name}, as LeRobot does")
-        return taken
+        # a look at the first rows will do: weight decay changes all of them
+        if not apart and not torch.equal(read_tensor(head)[:1024], read_tensor(embedding)[:1024]):
+            self.notes.append("lm_head and embed_tokens differ: prompts are embedded by embed_tokens, as LeRobot does")
+        return embedding
 
 
 def _read_headers(folder: Path) -> list[Stored]:

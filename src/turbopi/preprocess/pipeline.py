@@ -363,6 +363,7 @@ class Pipeline:
             labels=self.config.prompt_labels,
             write=self.write,
             tagged=tagged,
+            cut=self.write is not action_text,
         )
 
     def _pad_state(self, sample: Incoming) -> None:

@@ -4,7 +4,9 @@ Source: LeRobot's open PR 4184 (f2c8867), `text_processor_pi052.py` and `inferen
 """
 
 import functools
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from turbopi.models.pi0.decoding import EOS
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.support.errors import TokenizerError
 
+_BYTE = re.compile("<0x[0-9A-F]{2}>")
 _SPECIAL = (0, 1, 2, 3)  # padding, end, beginning and unknown, of PaliGemma's tokenizer
 
 
@@ -49,9 +52,24 @@ def joint_ids(
 def text_of(tokenizer: PromptTokenizer, ids: Sequence[int]) -> str:
     """What ids say, without those that stand for no text, blanks around it, and several in a row."""
     encoder: Pieces = tokenizer.encoder  # type: ignore[assignment]  # checked below
-    if not hasattr(encoder, "decode"):
+    if not hasattr(encoder, "id_to_piece"):
         raise TokenizerError(
-            f"the tokenizer, a {type(encoder).__name__}, has no decode: text is read with PaliGemma's, as a "
+            f"the tokenizer, a {type(encoder).__name__}, has no id_to_piece: text is read with PaliGemma's, as a "
             "SentencePiece model or a tokenizer.json"
         )
-    return " ".join(encoder.decode([one for one in ids if one not in _SPECIAL]).split())
+    pieces = [encoder.id_to_piece(one) for one in ids if one not in _SPECIAL and one < encoder.vocab_size()]
+    text = "".join(_joined(run) if is_byte else "".join(run) for is_byte, run in groupby(pieces, _is_byte))
+    return " ".join(text.replace("\N{LOWER ONE EIGHTH BLOCK}", " ").split())
+
+
+def _is_byte(piece: str) -> bool:
+    return _BYTE.fullmatch(piece) is not None
+
+
+def _joined(run: Iterable[str]) -> str:
+    """Bytes that aren't UTF-8 together are a replacement character each, as in transformers."""
+    found = bytes(int(piece[3:5], 16) for piece in run)
+    try:
+        return found.decode()
+    except UnicodeDecodeError:
+        return "\N{REPLACEMENT CHARACTER}" * len(found)

@@ -6,6 +6,7 @@ Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcess
 """
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -82,10 +83,12 @@ class PromptTokenizer:
     encoder     see `Encoder`
     vocab_size  of the model: an id past it is refused
     source      where the encoder came from, for people
+    controls    ids of control pieces that a text may name, such as <eos>: LeRobot reads them so, openpi as letters
     """
 
     def __init__(self, encoder: Encoder, *, vocab_size: int, source: str = "given object") -> None:
         self.encoder, self.vocab_size, self.source = encoder, vocab_size, source
+        self.controls: dict[str, int] = {}
         self._truncated_prompt: str | None = None  # warned about last
         self._newline: list[int] | None = None  # Pi0's, which is encoded by itself: always the same
 
@@ -126,7 +129,11 @@ class PromptTokenizer:
         return ids
 
     def _ids(self, text: str, add_bos: bool) -> list[int]:
-        return list(map(int, self.encoder.encode(text, add_bos=add_bos)))
+        between = re.split(f"({'|'.join(map(re.escape, self.controls))})", text) if self.controls else [text]
+        ids = list(map(int, self.encoder.encode(between[0], add_bos=add_bos)))
+        for control, behind in zip(between[1::2], between[2::2], strict=True):
+            ids += [self.controls[control], *map(int, self.encoder.encode(behind, add_bos=False))]
+        return ids
 
     def tokenize(
         self,
@@ -138,11 +145,12 @@ class PromptTokenizer:
         labels: bool = False,
         write: Write | None = None,
         tagged: bool = False,
+        cut: bool = True,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
         `as_is`, `labels`, `write`: see `encode`. A longer prompt loses its end, as in openpi, or what the encoder's
-        `truncation_side` says; a warning is logged once for each. `tagged`: it is an ObservationError instead.
+        `truncation_side` says; a warning is logged once for each. `tagged`, not `cut`: an ObservationError instead.
         """
         ids = self.encode(prompt, state, as_is=as_is, labels=labels, write=write)
         count = min(len(ids), max_tokens)
@@ -150,6 +158,10 @@ class PromptTokenizer:
             raise ObservationError(
                 f"the prompt and guidance's tag take {len(ids)} tokens, but the model reads {max_tokens}: the tag, or "
                 f"the state behind it, would be cut. Shorten the prompt: {prompt[:200]!r}"
+            )
+        if count < len(ids) and not cut:
+            raise ObservationError(
+                f"the prompt takes {len(ids)} tokens; expected at most {max_tokens}: it is never cut"
             )
         if count < len(ids):
             left = getattr(self.encoder, "truncation_side", "right") == "left"
@@ -232,7 +244,7 @@ def load_tokenizer(
 def tokenizer_of(checkpoint: Checkpoint, given: str | Path | Encoder | None = None) -> PromptTokenizer:
     """A checkpoint's, unless another is `given`; random weights know no word, so any will do."""
     model, wordless = checkpoint.config.model, checkpoint.format == "random" and given is None
-    return load_tokenizer(
+    found = load_tokenizer(
         TINY_TOKENIZER if wordless else given,
         checkpoint_dir=checkpoint.path,
         named=checkpoint.named_tokenizer,
@@ -240,6 +252,10 @@ def tokenizer_of(checkpoint: Checkpoint, given: str | Path | Encoder | None = No
         vocab_size=model.vocab_size,
         paligemma=wordless or family_of(model).paligemma,
     )
+    if checkpoint.format == "lerobot" and isinstance(encoder := found.encoder, sentencepiece.SentencePieceProcessor):
+        special = (encoder.pad_id(), encoder.bos_id(), encoder.eos_id(), encoder.unk_id())
+        found.controls = {encoder.id_to_piece(place): place for place in special if place >= 0}
+    return found
 
 
 def _own_tokenizer(source: str | Path | None, vocab_size: int, places: Sequence[Path]) -> PromptTokenizer:

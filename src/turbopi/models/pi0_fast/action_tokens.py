@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from turbopi.config import Owner
 from turbopi.models.family import Pieces
 from turbopi.support.errors import ActionError, TokenizerError
-from turbopi.support.reading import Fields, read_json
+from turbopi.support.reading import Fields, read_json, shown
 
 BEGINNING, END = "Action: ", "|"
 SETTINGS = "processor_config.json"
@@ -39,7 +39,7 @@ class FastTokenizer:
 
     @classmethod
     def from_folder(cls, folder: Path) -> "FastTokenizer":
-        """Raises TokenizerError for a folder without the two files, or with damaged ones."""
+        """Raises TokenizerError for a folder without the two files, damaged ones, and other ways to decode."""
         found = next((folder / name for name in _LAYOUTS if (folder / name).is_file()), None)
         settings = folder / SETTINGS
         if found is None or not settings.is_file():
@@ -49,10 +49,19 @@ class FastTokenizer:
         fields = Fields(read_json(settings, TokenizerError), settings, TokenizerError)
         scale, min_token = fields.number("scale"), fields.integer("min_token", -(2**20), 2**20)
         try:
-            vocabulary = json.loads(found.read_text(encoding="utf-8"))["model"]["vocab"]
-            pieces = {int(code): _bytes_of(piece) for piece, code in vocabulary.items()}
+            content = json.loads(found.read_text(encoding="utf-8"))
+            added = {token["content"]: token["id"] for token in content.get("added_tokens") or []}
+            pieces = {int(code): _bytes_of(piece) for piece, code in (content["model"]["vocab"] | added).items()}
+            decoder, beside = content["decoder"]["type"], found.with_name("tokenizer_config.json")
+            cleans = beside.is_file() and json.loads(beside.read_text("utf-8")).get("clean_up_tokenization_spaces")
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TokenizerError(f"{found}: no vocabulary of byte-level BPE ({error!r})") from error
+        if decoder != "ByteLevel":
+            raise TokenizerError(f"{found}: the decoder is {shown(decoder)}; expected 'ByteLevel'")
+        if cleans:  # blanks before punctuation: each is a coefficient
+            raise TokenizerError(
+                f"{beside}: clean_up_tokenization_spaces drops coefficients of actions; set it to false"
+            )
         return cls(pieces, scale, min_token)
 
     def text(self, codes: Sequence[int]) -> str:

@@ -5,8 +5,8 @@
     generate(observation, …)      both, until the answer is over
 
 It is Pi0's vision tower, projector and language model without the action expert; a token's logits are the final norm's
-output times the embedding table. openpi and LeRobot run it differently, see `FastRules`. The loop: pi0/decoding.py,
-whose shapes these are, with C cameras and P prompt places.
+output times the embedding table, or times a head that was trained apart from it. openpi and LeRobot run it differently,
+see `FastRules`. The loop: pi0/decoding.py, whose shapes these are, with C cameras and P prompt places.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,6 +59,12 @@ class Pi0FastModel(Writer):
         self.vision = VisionTower(config.vision)
         self.projector = nn.Linear(config.vision.width, config.vlm.width)
         self.vlm = Gemma(config.vlm, eps=config.rms_norm_eps, vocab_size=config.vocab_size, adaptive=False)
+        if not config.tied_head:
+            self.lm_head = nn.Linear(config.vlm.width, config.vocab_size, bias=False)
+
+    @property
+    def head(self) -> Tensor:
+        return self.vlm.embed_tokens.weight if self.config.tied_head else self.lm_head.weight
 
     @classmethod
     def from_state(cls, config: Pi0FastConfig, state: dict[str, Tensor]) -> "Pi0FastModel":
