@@ -23,7 +23,9 @@ def build(job: dict[str, Any]) -> Built:
 
     def drawn(*shape: Any, **options: Any) -> torch.Tensor:
         found = empty(*shape, **options)
-        return found.normal_(std=0.02) if found.is_floating_point() else found
+        if found.is_floating_point():
+            found.detach().normal_(std=0.02)  # what it compiles makes some, too, which may require gradients
+        return found
 
     torch.empty = drawn
     model = Pi05Inference({"language_embeds": embeds}, job["cameras"], job["horizon"], discrete_state_input=False)
