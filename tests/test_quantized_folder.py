@@ -237,9 +237,7 @@ def test_writing_and_loading_hold_a_few_matrices(tmp_path: Path) -> None:
     kept = open_checkpoint(folder)
     room = WeightPlacement(SMALL, CPU, lambda name: True, lambda place, matrix: matrix, precision="fp8")
     loaded = peak_bytes(lambda: kept.load(room, "bf16"), folder / TENSORS)
-    of_the_device = [
-        one.nbytes for one in room.made.values() if isinstance(one, Tensor)
-    ]  # vision, 72 wide
+    of_the_device = [one.nbytes for one in room.made.values() if isinstance(one, Tensor)]  # vision, 72 wide
     assert (loaded - sum(of_the_device) - 2 * SMALL.vocab_size * SMALL.vlm.width) / scale < LIMIT
 
 
