@@ -158,8 +158,8 @@ def test_loading_for_eight_bits_never_holds_the_weights_on_the_host(tmp_path: Pa
         mine = [one for name, one in state.items() if not name.startswith("expert.") and "dense" not in name]
         return sum(one.nbytes for one in mine)
 
-    gone = torch.empty(0, 0)  # a matrix that a GPU has
-    peak, loaded = peak_and_state(lambda place, matrix: gone, lambda name: name.startswith("expert."))
+    on_gpu = torch.empty(0, 0)  # a matrix that a GPU has
+    peak, loaded = peak_and_state(lambda place, matrix: on_gpu, lambda name: name.startswith("expert."))
     scale = loaded.bytes / FULL_BYTES
     assert 0.3 * LIMIT < (peak - on_device(loaded.state)) / scale < LIMIT
     before, _ = peak_and_state(None, lambda name: True)

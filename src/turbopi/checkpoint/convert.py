@@ -36,7 +36,7 @@ from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.files import new_folder
 
-_DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
+DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
     "bf16": ("BF16", torch.bfloat16),
     "f32": ("F32", torch.float32),
 }
@@ -57,8 +57,8 @@ def convert(
 
     Raises CheckpointError if `dst` exists and isn't an empty folder, and whatever `open_checkpoint` raises.
     """
-    if precision not in _DTYPES:
-        raise ConfigError(f"precision is {precision!r}; expected one of {', '.join(_DTYPES)}")
+    if precision not in DTYPES:
+        raise ConfigError(f"precision is {precision!r}; expected one of {', '.join(DTYPES)}")
     dst = check_new(dst)
     checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
     with new_folder(dst) as folder:
@@ -93,7 +93,7 @@ def write_random(
 
 def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision, progress: bool) -> None:
     """Header first, then every piece at its place."""
-    stored, dtype = _DTYPES[precision]
+    stored, dtype = DTYPES[precision]
     tensors = {to_openpi(name): (stored, shape) for name, shape in checkpoint.source.shapes.items()}
     model = checkpoint.config.planned_model
     tensors[UNUSED_HEAD] = (stored, (model.vocab_size, model.expert.width))
