@@ -62,7 +62,7 @@ class FusedBackend(CudaGraphBackend):
     JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _without: Mapping[str, str] = MappingProxyType({})  # what failed its self-test on this GPU, and how
-    _kept_expert: Mapping[str, ScaledMatrix] = MappingProxyType({})  # in eight bits, mapped from the checkpoint's file
+    _kept_expert: Mapping[str, ScaledMatrix] = MappingProxyType({})  # in eight bits, of a folder that has them so
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 

@@ -26,7 +26,7 @@ from turbopi.quantization.plan import PrecisionPlan, Tier
 from turbopi.quantization.sites import PARTS
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import new_folder
-from turbopi.version import turbopi_version
+from turbopi.support.provenance import provenance
 
 
 def write_quantized(
@@ -56,14 +56,15 @@ def write_quantized(
         write_beside(checkpoint, folder)
         with (folder / TENSORS).open("wb") as out:
             tensors = tensors_of(config, plan)
-            about = {} if checkpoint.random is None else {RANDOM_KEY: checkpoint.random}
-            room = _Room(checkpoint, device, plan, TensorFile(out, tensors, about), set(tensors))
+            marks = {} if checkpoint.random is None else {RANDOM_KEY: checkpoint.random}
+            room = _Room(checkpoint, device, plan, TensorFile(out, tensors, marks), set(tensors))
             checkpoint.load(room, "bf16", progress=progress)
             assert room.written == set(tensors), room.written ^ set(tensors)
             out.flush()
             os.fsync(out.fileno())
         own = f"turbopi_{plan.format.name}.json"
         calibration.save(folder / own)
+        about = provenance(device)
         manifest = {
             "format": FORMAT,
             "version": VERSION,
@@ -75,7 +76,7 @@ def write_quantized(
             "random_weights": checkpoint.random,
             "bytes": (folder / TENSORS).stat().st_size,
             "sizes": asdict(config),
-            "versions": {"turbopi": turbopi_version(), "torch": str(torch.__version__)},
+            "versions": {"turbopi": about.turbopi, "torch": about.torch, "triton": about.triton},
         }
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
     return dst

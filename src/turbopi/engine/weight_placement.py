@@ -10,6 +10,7 @@ ever holds more than a few of them in bfloat16.
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 
 import torch
@@ -101,6 +102,9 @@ class WeightPlacement:
             empty_cache()  # of what making it left
 
     def give(self, place: str, matrix: ScaledMatrix) -> None:
+        """The expert's are copied: they stay on the host, and a file that is overwritten would end the process."""
+        if place.startswith("expert."):
+            matrix = replace(matrix, data=matrix.data.clone(), scale=matrix.scale.clone())
         self.kept[place] = matrix
 
 
