@@ -161,7 +161,7 @@ def test_a_part_in_fp8_beside_one_in_full() -> None:
 def test_hidden_columns_of_vision_fill_whole_lines_of_memory(format: Format, monkeypatch: pytest.MonkeyPatch) -> None:
     """The zeros behind them change no number, and matrices that aren't rounded have none."""
     whole, narrow = pack_with_hidden(112, ("fc1", "fc2"), format), pack_with_hidden(112, ("fc2",), format)
-    monkeypatch.setattr(engine_weights, "_in_whole_lines", lambda *both: both)
+    monkeypatch.setattr(engine_weights, "in_whole_lines", lambda *both: both)
     as_it_was = pack_with_hidden(112, ("fc1", "fc2"), format)
     for layer, before in zip(whole.vision, as_it_was.vision, strict=True):
         (fc1, bias), (fc2, last_bias) = layer.fc1, layer.fc2

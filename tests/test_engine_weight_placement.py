@@ -1,18 +1,27 @@
 """Weights are read to where packing wants them: the same numbers, and nothing is held twice."""
 
-from collections.abc import Callable
-from dataclasses import replace
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass, replace
+from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.profiler import ProfilerActivity
 
-from turbopi.checkpoint import random_checkpoint
-from turbopi.config import PRESETS
+from turbopi.checkpoint import open_checkpoint, random_checkpoint, write_random
+from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, VisionConfig
 from turbopi.engine.weight_placement import GATE_UP, WeightPlacement, is_conditioning, join, joined_with
 from turbopi.engine.weights import Weights, pack
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.models import parameter_shapes
+from turbopi.quantization.directions import directions
+from turbopi.quantization.formats import FORMATS, Format
+from turbopi.quantization.fp8 import Matrix
+from turbopi.support.errors import CheckpointError
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 CONFIG = PRESETS["pi05_tiny"].with_model(vocab_size=64)
@@ -72,6 +81,95 @@ def test_a_room_keeps_nothing_of_what_it_gave_away() -> None:
     assert gate == up != other_gate == other_up
 
 
+def rounded(format: Format) -> Callable[[str, Tensor], Matrix]:
+    """As `fused` makes matrices: in eight bits, of some sites for directions, and some as they are."""
+
+    def make(place: str, matrix: Tensor) -> Matrix:
+        if place == "prefix.0.out" or not matrix.numel():
+            return matrix
+        common = None
+        if place.endswith((".0.qkv", ".1.down")):
+            rows = torch.randn(40, matrix.shape[1], generator=torch.Generator().manual_seed(len(place)))
+            common = directions(rows)
+        return quantize(matrix, 0.02, common, format)
+
+    return make
+
+
+@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+def test_matrices_rounded_as_they_are_read_have_the_bits_of_those_rounded_when_all_is_read(format: Format) -> None:
+    model, checkpoint, make = CONFIG.planned_model, random_checkpoint(CONFIG), rounded(format)
+    expected = pack(model, checkpoint.load("cpu", "bf16").state, make)
+    placement = WeightPlacement(model, CPU, nothing, make)
+    state = checkpoint.load(placement, "bf16").state
+    assert not any(name.startswith("vision.layers") and name.endswith("proj.weight") for name in state)
+    found = pack(model, state, made=placement.made)
+    assert not placement.made
+    ours, theirs = list(numbers_of(found)), list(numbers_of(expected))
+    assert sum(one.element_size() == 1 for one in ours) > 10
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.dtype == other.dtype and one.shape == other.shape
+        assert torch.equal(one.contiguous().view(torch.uint8), other.contiguous().view(torch.uint8))
+
+
+def numbers_of(weights: Any) -> Iterator[Tensor]:
+    """All tensors in it, scalars too, in order."""
+    if isinstance(weights, Tensor):
+        yield weights.reshape(-1) if weights.ndim else weights[None]
+    elif isinstance(weights, float):
+        yield torch.tensor([weights])
+    elif isinstance(weights, list | tuple | dict):
+        for one in weights.values() if isinstance(weights, dict) else weights:
+            yield from numbers_of(one)
+    elif is_dataclass(weights):
+        yield from numbers_of(vars(weights))
+
+
+# full Pi0.5's proportions at a 250th of its size
+SMALL = ModelConfig(
+    vision=VisionConfig(width=72, depth=27, mlp_dim=272, num_heads=4),
+    vlm=GemmaConfig(width=128, mlp_dim=1024, head_dim=16),
+    expert=GemmaConfig(width=64, mlp_dim=256, head_dim=16),
+    vocab_size=16_000,
+)
+FULL_BYTES, LIMIT = 6.9e9, 1.5e9  # full Pi0.5's weights in bfloat16; what the host may hold of them
+
+
+def peak_bytes(run: Callable[[], Any], file: Path) -> int:
+    """The most bytes that PyTorch holds while something runs, without the mapped file, which it counts, too."""
+    with torch.profiler.profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profile:
+        run()
+    events = [event for event in profile.profiler.kineto_results.events() if event.name() == "[memory]"]
+    events = [event for event in events if abs(event.nbytes()) < 0.9 * file.stat().st_size]
+    return max(accumulate(event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())))
+
+
+def test_loading_for_eight_bits_never_holds_the_weights_on_the_host(tmp_path: Path) -> None:
+    """Counted from PyTorch's own allocations and frees, not from what the system says."""
+    write_random(PolicyConfig("small", SMALL, "plain"), tmp_path / "small")
+    checkpoint = open_checkpoint(tmp_path / "small")
+
+    def peak_and_state(make: Callable[[str, Tensor], Matrix] | None, on_host: Callable[[str], bool]) -> tuple[int, Any]:
+        found: list[Any] = []
+        room = WeightPlacement(SMALL, CPU, on_host, make)
+        peak = peak_bytes(lambda: found.append(checkpoint.load(room, "bf16")), tmp_path / "small" / "model.safetensors")
+        return peak, found[0]
+
+    def on_device(state: dict[str, Tensor]) -> int:
+        """Of what isn't rounded, whatever the state has besides."""
+        mine = [
+            one for name, one in state.items() if not re.match(r"expert\.|v\w+\.layers\..*(proj|fc\d)\.weight", name)
+        ]
+        return sum(one.nbytes for one in mine)
+
+    on_gpu = torch.empty(0, 0)  # a matrix that a GPU has
+    peak, loaded = peak_and_state(lambda place, matrix: on_gpu, lambda name: name.startswith("expert."))
+    scale = loaded.bytes / FULL_BYTES
+    assert 0.3 * LIMIT < (peak - on_device(loaded.state)) / scale < LIMIT
+    before, _ = peak_and_state(None, lambda name: True)
+    assert before / scale > 0.9 * FULL_BYTES
+
+
 def test_a_damaged_number_is_found_wherever_it_lies(monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = random_checkpoint(CONFIG)
     pieces = checkpoint.source.pieces
@@ -83,8 +181,9 @@ def test_a_damaged_number_is_found_wherever_it_lies(monkeypatch: pytest.MonkeyPa
             yield piece
 
     monkeypatch.setattr(checkpoint.source, "pieces", damaged)
-    with pytest.raises(Exception, match=r"vlm\.layers\.1\.self_attn\.k_proj\.weight"):
-        checkpoint.load(WeightPlacement(CONFIG.planned_model, CPU, nothing), "bf16")
+    for make in (None, lambda place, matrix: matrix):
+        with pytest.raises(CheckpointError, match=r"vlm\.layers\.1\.self_attn\.k_proj\.weight"):
+            checkpoint.load(WeightPlacement(CONFIG.planned_model, CPU, nothing, make), "bf16")
 
 
 @pytest.mark.parametrize(

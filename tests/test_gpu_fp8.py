@@ -1,6 +1,7 @@
 """FP8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
 
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +13,10 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.backends.fused import FusedBackend
+from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PiKind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
+from turbopi.engine.quantized_writer import write_quantized
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.models.observation import Observation
@@ -48,7 +51,10 @@ def quantization(kind: PiKind, target: float) -> Quantization:
 
 @lru_cache
 def backend(kind: PiKind, precision: Precision, target: float = 0.0, kernels: str = "auto") -> backends.Backend:
-    checkpoint = golden_folder().checkpoint(kind)
+    return made(golden_folder().checkpoint(kind), precision, quantization(kind, target), kernels)
+
+
+def made(checkpoint: Checkpoint, precision: Precision, calibration: Quantization, kernels: str) -> backends.Backend:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TURBOPI_KERNELS", kernels)
         return backends.create(
@@ -57,7 +63,7 @@ def backend(kind: PiKind, precision: Precision, target: float = 0.0, kernels: st
             lambda to, mode: checkpoint.load(to, mode).state,
             device=torch.device("cuda", 0),
             precision=precision,
-            quantization=quantization(kind, target),
+            quantization=calibration,
         )
 
 
@@ -92,6 +98,25 @@ def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision
     )
     assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+@pytest.mark.parametrize("kernels", ["auto", "portable"])
+def test_a_folder_that_keeps_fp8_has_the_same_actions_to_the_last_bit(kernels: str, tmp_path: Path) -> None:
+    """Of the denoising kernel, of operations in FP8 (a batch) and of those in bfloat16 (more actions)."""
+    calibration, one = quantization("pi05", 0.0), golden_cases()["b_third_masked"]
+    source = golden_folder().checkpoint("pi05")
+    folder = write_quantized(source, tmp_path / "fp8", calibration, "fp8", torch.device("cuda", 0))
+    kept, own = made(open_checkpoint(folder), "fp8", calibration, kernels), backend("pi05", "fp8", kernels=kernels)
+    four = Observation(
+        **{name: value.repeat(4, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    for observation, noise in (
+        (one.observation, one.noise),
+        (four, one.noise.repeat(4, 1, 1)),
+        (one.observation, torch.randn(1, 80, one.noise.shape[2], generator=torch.Generator().manual_seed(0))),
+    ):
+        actions = [each.sample(observation, noise, STEPS).actions for each in (kept, own)]
+        assert bool(actions[0].isfinite().all()) and torch.equal(*actions)
 
 
 @pytest.mark.parametrize("kernels", ["auto", "portable"])

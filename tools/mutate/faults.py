@@ -176,11 +176,19 @@ FAULTS = (
     ),
     Fault(
         "gate and up swapped in the packed matrix",
-        "turbopi.engine",
+        "turbopi.checkpoint",
         '("gate_proj", "up_proj")',
         '("up_proj", "gate_proj")',
         "every feed-forward is wrong",
         (ENGINE,),
+    ),
+    Fault(
+        "matrices that are rounded stay on the host",
+        "turbopi.checkpoint",
+        "room.take(name, state.pop(name))",
+        "room.take(name, state[name])",
+        "FP8 and INT8 need as much host memory as the weights",
+        ("tests/test_engine_weight_placement.py::test_loading_for_eight_bits_never_holds_the_weights_on_the_host",),
     ),
     Fault(
         "adaRMS scales without their 1",
@@ -216,9 +224,9 @@ FAULTS = (
     ),
     Fault(
         "an FP8 matrix whose input is multiplied by its scale",
-        "turbopi.kernels",
-        "return ScaledMatrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)",
-        "return ScaledMatrix(rounded, scale * input_scale, input_scale, weight.dtype)",
+        "turbopi.quantization",
+        "return replace(self, scale=self.scale * scale, inverse=1 / scale)",
+        "return replace(self, scale=self.scale * scale, inverse=scale)",
         "activations saturate or vanish",
         ("tests/test_kernels_fp8.py::test_a_matrix_has_a_scale_for_each_channel",),
     ),

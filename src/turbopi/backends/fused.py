@@ -32,7 +32,7 @@ from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.formats import INT8
-from turbopi.quantization.fp8 import Directions, Matrix
+from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix
 from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import KINDS
 from turbopi.support.errors import BackendUnavailable, DeviceLost
@@ -62,6 +62,7 @@ class FusedBackend(CudaGraphBackend):
     JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _without: Mapping[str, str] = MappingProxyType({})  # what failed its self-test on this GPU, and how
+    _kept_expert: Mapping[str, ScaledMatrix] = MappingProxyType({})  # in eight bits, of a folder that has them so
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
@@ -142,13 +143,17 @@ class FusedBackend(CudaGraphBackend):
 
     def _pack(self, load: LoadState) -> Weights:
         def on_host(name: str) -> bool:
-            """What is rounded comes to the GPU a matrix at a time, which then never holds the checkpoint in bfloat16;
-            so does the expert, in its kernel's order.
-            """
-            return self._plan is not None or name.startswith("expert.layers.") or is_conditioning(self.config, name)
+            """The expert comes to the GPU a matrix at a time, in its kernel's order."""
+            return name.startswith("expert.layers.") or is_conditioning(self.config, name)
 
-        placement = WeightPlacement(self.config, self.device, on_host)
-        weights = pack(self.config, load(placement, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        make = None if self._plan is None else self._quantized
+        placement = WeightPlacement(self.config, self.device, on_host, make, precision=self.precision)
+        state = load(placement, "bf16")
+        made = placement.made
+        for place in [place for place in placement.kept if not place.startswith("expert.")]:
+            made[place] = self._quantized(place, placement.kept.pop(place).to(self.device))
+        self._kept_expert = placement.kept
+        weights = pack(self.config, state, made=made, device=self.device, expert_device=HOST)
         self._expert = ExpertStore(weights.expert, self.device, {"packed": self._packed, "fp8": self._in_fp8})
         return weights
 
@@ -288,9 +293,19 @@ class FusedBackend(CudaGraphBackend):
             }
             return replace(layer, **made)
 
-        return [quantized(number, layer_on(layer, self.device)) for number, layer in enumerate(layers)]
+        known = self._rounded_before(layers)
+        return [quantized(number, layer_on(layer, self.device)) for number, layer in enumerate(known)]
 
-    def _quantized(self, place: str, matrix: Tensor) -> Matrix:
+    def _rounded_before(self, layers: Layers) -> Layers:
+        """The expert's layers with the matrices that a folder keeps in eight bits, if it does."""
+        if not self._kept_expert:
+            return layers
+        return [
+            replace(layer, **{kind: self._kept_expert[f"expert.{number}.{kind}"] for kind in KINDS["expert"]})  # type: ignore[arg-type]
+            for number, layer in enumerate(layers)
+        ]
+
+    def _quantized(self, place: str, matrix: Matrix) -> Matrix:
         if self._plan is None or place not in self._plan.scales:
             return matrix
         return quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
@@ -360,7 +375,7 @@ class FusedBackend(CudaGraphBackend):
         int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
         return kind.pack(
             self.config,
-            layers,
+            self._rounded_before(layers),
             inputs=self._expert_inputs(),
             directions=self._directions,
             device=self.device,

@@ -18,6 +18,7 @@ from torch import Tensor
 from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.names import EMBEDDING
 from turbopi.checkpoint.norm_stats import NormStats
+from turbopi.checkpoint.quantized_folder import QuantizedSource
 from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
 from turbopi.config import FloatPrecision, ModelConfig, PolicyConfig, memory_of
 from turbopi.models import family_of
@@ -35,6 +36,11 @@ class Room(Protocol):
     def __call__(self, name: str, shape: Shape, dtype: torch.dtype) -> Tensor:
         """An uninitialised tensor for a parameter."""
 
+    def takes(self, name: str) -> bool:
+        """Whether the room is given a parameter once all of it is read: then it isn't in the state that is loaded."""
+
+    def take(self, name: str, tensor: Tensor) -> None: ...
+
 
 @dataclass(frozen=True)
 class OneDevice:
@@ -44,6 +50,11 @@ class OneDevice:
 
     def __call__(self, name: str, shape: Shape, dtype: torch.dtype) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=self.device)
+
+    def takes(self, name: str) -> bool:
+        return False
+
+    def take(self, name: str, tensor: Tensor) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +84,7 @@ class Checkpoint:
 
     @property
     def format(self) -> str:
-        """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "random"."""
+        """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "quantized", "random"."""
         return self.source.format
 
     @property
@@ -115,31 +126,57 @@ class Checkpoint:
     def load(self, device: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
         """Read all weights into their final dtype and device, piece by piece.
 
-        Raises CheckpointError if a value is NaN or infinite, and as `check_hash`; for an ONNX export GraphsOnly.
+        Raises CheckpointError if a value is NaN or infinite, and as `check_hash`; for an ONNX export GraphsOnly, and
+        QuantizedOnly for weights in eight bits unless the room is for them.
         """
         self.check_hash()
         dtype_of = family_of(self.config.model).parameter_dtype
         room = OneDevice(torch.device(device)) if isinstance(device, (str, torch.device)) else device
         began = time.perf_counter()
-        shapes = self.source.shapes
+        source, shapes, total = self.source, self.source.shapes, 0
         state: dict[str, Tensor] = {}
-        sums: dict[torch.device, list[Tensor]] = {}  # of the pieces: one is finite only if all of its values are
+        sums: dict[str, list[Tensor]] = {}  # of the pieces: one is finite only if all of its values are
+        kept = source if isinstance(source, QuantizedSource) else None
+        pieces = source.pieces(room.device) if kept is None else kept.pieces_into(room)
         with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
-            for piece in self.source.pieces(room.device):
-                if piece.name not in state:
-                    dtype = dtype_of(piece.name, precision, self.config.model)
-                    state[piece.name] = room(piece.name, shapes[piece.name], dtype)
-                place = put(state[piece.name], piece)
-                sums.setdefault(place.device, []).append(place.sum())
+            for piece in pieces:
+                name = piece.name
+                if name not in sums:
+                    state[name] = room(name, shapes[name], dtype_of(name, precision, self.config.model))
+                    total += state[name].nbytes
+                place = put(state[name], piece)
+                sums.setdefault(name, []).append(place.sum())
                 advance.update(piece.values.numel() * piece.values.element_size())
-        assert state.keys() == shapes.keys(), state.keys() ^ shapes.keys()
-        if not all(all(torch.stack(some).isfinite().tolist()) for some in sums.values()):  # one may have overflowed
-            for name, tensor in state.items():
-                check_finite(tensor, self.source.native_name(name), self.path)
+                del place
+                if not shapes[name] or piece.start + len(piece.values) == shapes[name][0]:
+                    self._hand_over(name, state, sums, room)
+        expected = shapes.keys() if kept is None else kept.plain
+        assert sums.keys() == expected, sums.keys() ^ expected
+        self._check_finite(state, sums)
         if room.device.type == "cuda":
             torch.cuda.current_stream(room.device).synchronize()  # not the device: others may be capturing
-        total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
-        return Loaded(state, time.perf_counter() - began, total)
+        return Loaded(state, time.perf_counter() - began, total if kept is None else kept.bytes)
+
+    def _hand_over(
+        self, name: str, state: dict[str, Tensor], sums: dict[str, list[Tensor]], room: OneDevice | Room
+    ) -> None:
+        """Let the room take a parameter that is read: what it takes is checked before, and then no longer here."""
+        if room.takes(name):
+            self._check_finite({name: state[name]}, {name: sums[name]})
+            sums[name] = []
+            room.take(name, state.pop(name))
+
+    def _check_finite(self, state: dict[str, Tensor], sums: dict[str, list[Tensor]]) -> None:
+        """Raise CheckpointError if a value is NaN or infinite. sums: of pieces, which may have overflowed."""
+        by_device: dict[torch.device, list[Tensor]] = {}
+        for some in sums.values():
+            for one in some:
+                by_device.setdefault(one.device, []).append(one)
+        if not all(
+            all(torch.stack(some).isfinite().tolist()) for some in by_device.values()
+        ):  # one may have overflowed
+            for name, tensor in state.items():
+                check_finite(tensor, self.source.native_name(name), self.path)
 
     def load_head(self, device: torch.device | str, precision: FloatPrecision) -> Tensor | None:
         """The language head [V, D] of a Pi0.5 that writes text; None: its embedding table is the head.

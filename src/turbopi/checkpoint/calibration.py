@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 from turbopi.checkpoint.base import Checkpoint
+from turbopi.checkpoint.quantized_folder import QuantizedSource
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.formats import Numbers
 from turbopi.quantization.plan import TIERS, format_of
@@ -38,6 +39,9 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
     Raises ConfigError too where it leaves no site at all in eight bits: such a policy would be bfloat16 with
     another name.
     """
+    kept = checkpoint.source if isinstance(checkpoint.source, QuantizedSource) else None
+    if kept is not None:
+        kept.check(tier, None)
     if tier not in TIERS:
         check_given(tier, given)
         return None
@@ -52,6 +56,8 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
             )
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
+    if kept is not None:
+        kept.check(tier, quantization)
     if checkpoint.path is None:  # weights would have to be made to be hashed
         quantization.check_shapes(checkpoint.config.planned_model)
     else:

@@ -14,9 +14,7 @@ Everything is written into a temporary folder beside the target and renamed at t
 import json
 import os
 import shutil
-import struct
-from dataclasses import asdict, dataclass, fields
-from math import prod
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import torch
@@ -30,14 +28,15 @@ from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
 from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
 from turbopi.checkpoint.sizes import VARIANTS
-from turbopi.checkpoint.source import RANDOM_KEY, Shape, check_finite
+from turbopi.checkpoint.source import RANDOM_KEY, check_finite
+from turbopi.checkpoint.tensor_file import TensorFile
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, RealTime
 from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.files import new_folder
 
-_DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
+DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
     "bf16": ("BF16", torch.bfloat16),
     "f32": ("F32", torch.float32),
 }
@@ -58,17 +57,23 @@ def convert(
 
     Raises CheckpointError if `dst` exists and isn't an empty folder, and whatever `open_checkpoint` raises.
     """
-    if precision not in _DTYPES:
-        raise ConfigError(f"precision is {precision!r}; expected one of {', '.join(_DTYPES)}")
-    dst = Path(dst).expanduser()
-    if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
-        raise CheckpointError(f"{dst} exists and isn't an empty folder; give a new one")
+    if precision not in DTYPES:
+        raise ConfigError(f"precision is {precision!r}; expected one of {', '.join(DTYPES)}")
+    dst = check_new(dst)
     checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
     with new_folder(dst) as folder:
         write_beside(checkpoint, folder)
         _write_json(folder / "config.json", _openpi_config(checkpoint.config.planned_model, precision))
         _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
     return dst
+
+
+def check_new(folder: str | Path) -> Path:
+    """The path of a folder that is to be written. Raises CheckpointError if it exists and isn't an empty folder."""
+    folder = Path(folder).expanduser()
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CheckpointError(f"{folder} exists and isn't an empty folder; give a new one")
+    return folder
 
 
 def write_random(
@@ -86,56 +91,27 @@ def write_random(
 # -- the weights -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Slot:
-    """Where a tensor goes in the file."""
-
-    offset: int
-    row_bytes: int
-
-
 def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision, progress: bool) -> None:
     """Header first, then every piece at its place."""
-    stored, dtype = _DTYPES[precision]
-    shapes = {to_openpi(name): shape for name, shape in checkpoint.source.shapes.items()}
+    stored, dtype = DTYPES[precision]
+    tensors = {to_openpi(name): (stored, shape) for name, shape in checkpoint.source.shapes.items()}
     model = checkpoint.config.planned_model
-    shapes[UNUSED_HEAD] = (model.vocab_size, model.expert.width)
+    tensors[UNUSED_HEAD] = (stored, (model.vocab_size, model.expert.width))
     about = {TIED_EMBEDDING: TIED_HEAD}  # openpi's files record the tie like this
     if checkpoint.random is not None:
         about[RANDOM_KEY] = checkpoint.random
-    header, slots, size = _header(shapes, stored, dtype.itemsize, about)
     with (
         file.open("wb") as out,
         progress_bar(progress, f"writing {file.name}", checkpoint.stored_bytes) as advance,
     ):
-        out.write(header)
-        out.truncate(len(header) + size)
+        written = TensorFile(out, tensors, about)
         for piece in checkpoint.source.pieces(torch.device("cpu")):
-            values = piece.values.to(dtype).contiguous()
+            values = piece.values.to(dtype)
             check_finite(values, checkpoint.source.native_name(piece.name), checkpoint.path)
-            slot = slots[to_openpi(piece.name)]
-            out.seek(slot.offset + piece.start * slot.row_bytes)
-            out.write(values.reshape(-1).view(torch.uint8).numpy().data)
+            written.write(to_openpi(piece.name), values, piece.start)
             advance.update(piece.values.numel() * piece.values.element_size())
         out.flush()
         os.fsync(out.fileno())
-
-
-def _header(
-    shapes: dict[str, Shape], stored: str, itemsize: int, about: dict[str, str]
-) -> tuple[bytes, dict[str, _Slot], int]:
-    """The bytes before the data, each tensor's slot, and the length of the data."""
-    entries: dict[str, object] = {"__metadata__": about}
-    spans, end = {}, 0
-    for name in sorted(shapes):
-        start, end = end, end + prod(shapes[name]) * itemsize
-        entries[name] = {"dtype": stored, "shape": list(shapes[name]), "data_offsets": [start, end]}
-        spans[name] = start
-    text = json.dumps(entries, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
-    header = struct.pack("<Q", len(text)) + text
-    slots = {name: _Slot(len(header) + start, prod(shapes[name][1:]) * itemsize) for name, start in spans.items()}
-    return header, slots, end
 
 
 # -- what goes beside them ---------------------------------------------------------------------------------------------

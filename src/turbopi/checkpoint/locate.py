@@ -20,11 +20,13 @@ from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.packed import PACKED, differs, unpacked
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
+from turbopi.checkpoint.quantized_folder import MANIFEST as QUANTIZED
+from turbopi.checkpoint.quantized_folder import TENSORS
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
 from turbopi.support.errors import CheckpointError
 from turbopi.support.files import openpi_cache
 
-CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
+CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "quantized", "random"]
 
 _DOWNLOAD = {
     "gs": "gsutil -m cp -r {address} DIR (or openpi's own openpi.shared.download)",
@@ -61,6 +63,8 @@ def locate(path: str | Path) -> Location:
         return Location("lerobot", folder, folder, adapter=True, notes=_notes(folder, "lerobot", adapter=True))
     if (folder / ONNX_MANIFEST).is_file():
         return Location("onnx", folder, folder, notes=_notes(folder, "onnx"))
+    if (folder / QUANTIZED).is_file():
+        return Location("quantized", folder, folder, notes=_notes(folder, "quantized"))
     params = folder / "params"
     if (folder / WEIGHTS).is_file() or ((folder / INDEX).is_file() and not params.is_dir()):  # openpi's own order
         return _of_tensors(folder, folder)
@@ -111,12 +115,12 @@ def _notes(folder: Path, read: CheckpointFormat, *, adapter: bool = False) -> tu
     whole, index, params = folder / WEIGHTS, folder / INDEX, folder / "params"
     others = {
         params: read != "openpi_jax" and params.is_dir(),
-        whole: (read == "onnx" or adapter) and whole.is_file(),
+        whole: (read in ("onnx", "quantized") or adapter) and whole.is_file(),
         folder / PACKED: whole.is_file() and differs(folder),
         index: index.is_file() and (read == "openpi_jax" or (whole.is_file() and not _is_of(index, whole))),
     }
-    used = "the graphs" if read == "onnx" else "the adapter and its base" if adapter else whole.name
-    used = "params/" if read == "openpi_jax" else used
+    used = {"onnx": "the graphs", "quantized": TENSORS, "openpi_jax": "params/"}.get(read, whole.name)
+    used = "the adapter and its base" if adapter else used
     owner = {"openpi_jax": "openpi", "openpi_torch": "openpi", "lerobot": "LeRobot"}.get(read)
     as_owner = f", as by {owner}" if owner else ""
     verb = "are" if used.startswith("the ") else "is"

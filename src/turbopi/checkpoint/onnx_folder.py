@@ -125,10 +125,14 @@ def _read_manifest(file: Path) -> tuple[dict[str, Any], ModelConfig]:
                 one.text("dtype")
                 if not all(is_integer(axis) or _AXIS.fullmatch(str(axis)) for axis in one.list("shape")):
                     one.refuse("shape", "whole numbers and names of axes")
+    return manifest, model_of_sizes(fields)
+
+
+def model_of_sizes(fields: Fields) -> ModelConfig:
+    """The model whose `asdict` a manifest has as `sizes`. Raises CheckpointError if they aren't one's."""
     try:
         sizes = dict(fields.object("sizes").values)
         vision, vlm = VisionConfig(**sizes.pop("vision")), GemmaConfig(**sizes.pop("vlm"))
-        config = ModelConfig(vision=vision, vlm=vlm, expert=GemmaConfig(**sizes.pop("expert")), **sizes)
+        return ModelConfig(vision=vision, vlm=vlm, expert=GemmaConfig(**sizes.pop("expert")), **sizes)
     except (KeyError, TypeError, ConfigError) as error:
-        raise CheckpointError(f"{file}: its sizes aren't those of a model ({error})") from error
-    return manifest, config
+        raise CheckpointError(f"{fields.where}: its sizes aren't those of a model ({error})") from error

@@ -17,6 +17,7 @@ from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
+from turbopi.checkpoint.quantized_folder import QuantizedSource
 from turbopi.checkpoint.rlinf import in_known_layout
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
@@ -32,7 +33,9 @@ OPENPIS_ACTION_TOKENIZER = "physical-intelligence/fast"
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
-    """Open an openpi (PyTorch or JAX) or LeRobot checkpoint, or an ONNX export; everything is checked, nothing loaded.
+    """Open an openpi (PyTorch or JAX) or LeRobot checkpoint, or what `turbopi export` or `convert` made of one.
+
+    Everything is checked, nothing loaded.
 
     `path` is a checkpoint's folder (openpi's params/ and LeRobot's training output are understood too). `config` says
     what the folder doesn't record (docs/checkpoints.md). Sizes always come from the tensors.
@@ -55,7 +58,7 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     policy = _with_sizes(chosen, source, settings, location)
     found = find_norm_stats(folder, policy.asset_id, policy.normalization)
     source.notes += found.notes
-    if location.format != "onnx":
+    if location.format not in ("onnx", "quantized"):
         source.notes += notes_on_config_json(folder, source, policy)
     source.notes += notes_on_settings(folder, settings, replace(policy, asset_id=found.asset_id), policy_of)
     return Checkpoint(
@@ -146,6 +149,8 @@ def _source(location: Location, settings: Settings) -> WeightSource:
         raise ConfigError(f"{settings.source}: base_model only applies to adapters, and {location.weights} has weights")
     if location.format == "onnx":
         return GraphSource(open_export(location.folder))
+    if location.format == "quantized":
+        return QuantizedSource(location.folder)
     if location.format == "lerobot":
         source: WeightSource = _lerobot_weights(location.weights, location)
     else:

@@ -39,9 +39,9 @@ class Piece:
 class WeightSource(Protocol):
     """A checkpoint's weights under canonical names."""
 
-    format: str  # "openpi_torch", "openpi_jax", "lerobot", "onnx" or "random"
+    format: str  # "openpi_torch", "openpi_jax", "lerobot", "onnx", "quantized" or "random"
     shapes: dict[str, Shape]
-    dtypes: dict[str, str]  # stored: "F32", "BF16", "F16"; of ONNX exports also "F8_E4M3"
+    dtypes: dict[str, str]  # stored: "F32", "BF16", "F16"; of exports also "F8_E4M3", "I8"
     vision_heads: int | None  # where the layout carries them
     notes: list[str]  # what a reader of `inspect` should know (merged adapters, ...)
 

@@ -111,7 +111,7 @@ class TorchSource:
         return self._stored[name]
 
     def pieces(self, device: torch.device) -> Iterator[Piece]:
-        by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))
+        by_size = sorted(self._stored, key=lambda name: (-_nbytes(self._stored[name]), name))  # gate beside up
         for name in by_size:
             stored = self._stored[name]
             values = read_tensor(stored)

@@ -255,6 +255,7 @@ def bench(
     with empty_caches() if ready else nullcontext():
         from turbopi import backends as registry
         from turbopi.bench.run import BenchPlan, run
+        from turbopi.checkpoint.quantized_folder import precision_kept
         from turbopi.policy.call_options import Denoising
 
         opened = options.open(checkpoint)
@@ -263,6 +264,10 @@ def bench(
             if error:
                 output.line("the folder holds ONNX graphs and no weights: no error against the float32 reference")
             backends, device, error = backends.replace("auto", "onnx"), device.replace("auto", "cpu"), False
+        if (kept := precision_kept(opened)) is not None:
+            if error:
+                output.line(f"the folder holds weights in {kept} alone: no error against the float32 reference")
+            precisions, error = precisions or kept, False
         resolved = registry.resolve_device(device)
         chosen = _names(own_precision(_names(backends)) if precisions is None else precisions)
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created

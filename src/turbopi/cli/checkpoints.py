@@ -3,7 +3,9 @@
 import json
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -291,6 +293,7 @@ class _ConvertCommand(CheckpointThen):
         "turbopi convert checkpoints/jax checkpoints/pi05_droid --config pi05_droid",
         "turbopi convert my_lerobot_policy converted --precision f32",
         "turbopi convert checkpoints/jax my_arm --config pi05_base --robot my_arm.json",
+        "turbopi convert checkpoints/mine mine_fp8 --config pi05_droid --precision fp8",
         "turbopi convert --random-weights pi05_tiny tiny_checkpoint",
     ),
 )
@@ -305,18 +308,37 @@ def convert(
         ),
     ],
     precision: Annotated[
-        str, typer.Option("--precision", metavar="bf16|f32", help="In which the weights are written.")
+        str,
+        typer.Option(
+            "--precision",
+            metavar="bf16|f32|fp8|fp8-mlp|int8",
+            help="In which the weights are written. In eight bits: for backend fused in this precision alone.",
+        ),
     ] = "bf16",
+    quantization: Annotated[
+        Path | None,
+        typer.Option(
+            "--quantization",
+            metavar="FILE",
+            help="Calibration of weights in eight bits. Unless given, the one beside the checkpoint.",
+        ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            "--device", metavar="DEVICE", help="Where weights are rounded to eight bits: auto, cpu, cuda or cuda:N."
+        ),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a checkpoint in openpi's PyTorch layout, with its statistics and a turbopi.json that describes it.
+    """Write a checkpoint in openpi's PyTorch layout, or calibrated, its weights in eight bits.
 
-    Any format that Turbo-Pi reads goes in; --random-weights makes a checkpoint to try things with. --robot is recorded
-    in the turbopi.json, a description beside it.
+    Its statistics and a turbopi.json that describes it are there, too. Any format that Turbo-Pi reads goes in;
+    --random-weights makes a checkpoint to try things with. --robot is recorded in the turbopi.json, a description
+    beside it. In eight bits (fp8, fp8-mlp, int8) the folder has the calibration and loads without the checkpoint.
     """
     output = Output(as_json)
-    from turbopi.checkpoint import convert as write
-
+    write = _writer(precision, quantization, device)
     source, target = options.split("convert", paths, "new folder")
     opened = options.open(source)
     if options.robot is not None:
@@ -325,7 +347,7 @@ def convert(
     if opened.format != "random":
         _show_notes(opened.source.notes, output)
     started = time.perf_counter()
-    folder = write(opened, Path(target), precision=precision, progress=output.shows_progress)  # type: ignore[arg-type]
+    folder = write(opened, Path(target), progress=output.shows_progress)
     seconds = time.perf_counter() - started
     tokenizer = complete_random(folder, options.weights_seed or 0) if opened.format == "random" else None
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -343,6 +365,32 @@ def convert(
             "random_weights": opened.random is not None,
         }
     )
+
+
+def _writer(precision: str, quantization: Path | None, device: str | None) -> Callable[..., Path]:
+    """What writes an opened checkpoint to a folder. Raises ConfigError for options of another precision."""
+    from turbopi.checkpoint.convert import DTYPES, convert
+    from turbopi.quantization.plan import TIERS
+
+    if precision not in (*DTYPES, *TIERS):
+        raise ConfigError(f"--precision is {precision!r}; expected one of {', '.join((*DTYPES, *TIERS))}")
+    if precision not in TIERS:
+        given = {"--quantization": quantization, "--device": device}
+        if extra := [name for name, value in given.items() if value is not None]:
+            raise ConfigError(f"{' and '.join(extra)} only applies to --precision {', '.join(TIERS)}")
+        return partial(convert, precision=precision)  # type: ignore[arg-type]
+    from turbopi.backends import resolve_device
+    from turbopi.checkpoint.calibration import for_policy
+    from turbopi.engine.quantized_writer import write_quantized
+
+    def write(checkpoint: "Checkpoint", folder: Path, *, progress: bool) -> Path:
+        _ = checkpoint.config.planned_model  # other families are refused before a calibration is looked for
+        calibration = for_policy(quantization, precision, checkpoint)
+        assert calibration is not None, "which every tier has"
+        on = resolve_device(device or "auto")
+        return write_quantized(checkpoint, folder, calibration, precision, on, progress=progress)
+
+    return write
 
 
 def _for_robot(checkpoint: "Checkpoint", robot: str) -> "Checkpoint":

@@ -218,8 +218,8 @@ class PolicyOptions(RobotOptions):
             "--precision",
             panel=_RUNNING,
             metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8",
-            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, bf16, "
-            "or what --backend has instead.",
+            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, what the "
+            "folder keeps its weights in, else bf16, or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[
@@ -292,7 +292,13 @@ class PolicyOptions(RobotOptions):
         }
 
     def for_checkpoint(self, checkpoint: "Checkpoint") -> "PolicyOptions":
-        """The same; for an ONNX export what is left to choose is the one backend that runs it, and its device."""
+        """The same; for an ONNX export what is left to choose is the one backend that runs it, and its device; for
+        weights in eight bits their precision.
+        """
+        from turbopi.checkpoint.quantized_folder import precision_kept
+
+        if self.precision is None and (kept := precision_kept(checkpoint)) is not None:
+            return replace(self, precision=kept)
         if checkpoint.format != "onnx":
             return self
         backend = "onnx" if self.backend == "auto" else self.backend
@@ -327,7 +333,9 @@ class PolicyOptions(RobotOptions):
             f"({about['device_name']}), {denoising(about)}{loaded}"
         )
         if self.precision is None and about["precision"] != "bf16":
-            output.line(f"precision: {about['precision']}, as {about['backend']} doesn't run in bf16")
+            kept = fitting.precision is not None
+            why = "which the folder's weights are in" if kept else f"as {about['backend']} doesn't run in bf16"
+            output.line(f"precision: {about['precision']}, {why}")
         output.line(f"backend: {about['backend']} ({as_typed(about['backend_reason'])})")
         if about.get("kept"):
             output.line(f"its ONNX export stays for the next start: {about['export']}")

@@ -232,7 +232,8 @@ def _open(requested: Requested, checkpoint: str | None, output: Output) -> "Chec
         raise ConfigError(
             f"{opened.path} has memory, and the replicas of a fleet keep no robot's history: take `turbopi serve`"
         )
-    anywhere = replace(requested.policy, backend="pytorch", precision=None, device="cpu")  # replicas may run elsewhere
+    # replicas may run elsewhere
+    anywhere = replace(requested.policy, backend="pytorch", precision="bf16", device="cpu")
     check_server(replace(requested.server, max_batch=None), anywhere, opened)
     requested.policy.tell_if_random(opened, output)
     return opened

@@ -5,23 +5,25 @@ state is the host's, no more than one layer as the checkpoint has it. Of a state
 nothing is there twice.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from turbopi.checkpoint.matrices import QKV, is_used, matrix_names
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
-from turbopi.engine.weight_placement import GATE_UP, QKV, is_conditioning, join
-from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
+from turbopi.engine.weight_placement import MakeMatrix, in_whole_lines, is_conditioning, join
+from turbopi.kernels.interface import Affine, GemmaLayer, State, VisionLayer
 from turbopi.models import family_of
 from turbopi.models.pi0.denoise import time_embedding, time_grid
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix, whole_lines
-
-MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
+from turbopi.quantization.fp8 import Matrix
+from turbopi.quantization.sites import Part
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,14 @@ def _as_it_is(place: str, matrix: Tensor) -> Tensor:
 class _Tensors:
     """A checkpoint's, each of which is taken once, and then lies on the device."""
 
-    def __init__(self, state: State, device: torch.device | None) -> None:
-        self._state, self._device = state, device
+    def __init__(
+        self,
+        state: State,
+        device: torch.device | None,
+        make: MakeMatrix = _as_it_is,
+        made: dict[str, Matrix] | None = None,
+    ) -> None:
+        self._state, self._device, self._make, self._made = state, device, make, made or {}
 
     def __call__(self, name: str) -> Tensor:
         tensor = self._state.pop(name)
@@ -61,6 +69,17 @@ class _Tensors:
     def joined(self, names: Sequence[str]) -> Tensor:
         return join([self._state.pop(name) for name in names], self._device)
 
+    def matrix(self, config: ModelConfig, part: Part, layer: int, kind: str) -> Any:
+        """The one at this place, made into what it shall be, if it isn't yet."""
+        place, names = f"{part}.{layer}.{kind}", matrix_names(part, layer, kind)
+        if place in self._made:
+            return self._made.pop(place)
+        if not is_used(config, place):
+            self._state |= {name: self._state[name][:0].clone() for name in names if name in self._state}
+        if names[0] not in self._state:  # of a folder that keeps what is used
+            return torch.empty(0, 0, device=self._device)
+        return self._make(place, self(names[0]) if len(names) == 1 else self.joined(names))
+
     def scale(self, name: str) -> Tensor | None:
         """1 + a norm's weight, float32; None for adaRMS, which has none."""
         return 1 + self(f"{name}.weight").float() if f"{name}.weight" in self._state else None
@@ -71,16 +90,18 @@ def pack(
     state: State,
     make: MakeMatrix = _as_it_is,
     *,
+    made: dict[str, Matrix] | None = None,
     device: torch.device | None = None,
     expert_device: torch.device | None = None,
 ) -> Weights:
-    """Pack a checkpoint's tensors (canonical names); `state` is emptied.
+    """Pack a checkpoint's tensors (canonical names); `state` and `made` are emptied.
 
     make    may turn the vision tower's and the prefix's packed matrices, on the device, into others, one by one
+    made    those that a `WeightPlacement` has turned already
     device  where they shall lie; None: where they are
     expert_device  the same for the action expert's layers
     """
-    take = _Tensors(state, device)
+    take = _Tensors(state, device, make, made)
     conditioning = {name: state.pop(name).cpu() for name in sorted(state) if is_conditioning(config, name)}
     empty_cache()  # of what loading needed besides
     patch_weight, patch_bias = take.affine("vision.patch_embedding")
@@ -88,77 +109,43 @@ def pack(
     weights = Weights(
         patch=patch_weight.flatten(1),
         position=take("vision.position_embedding.weight") + patch_bias,
-        vision=list(_vision_layers(config, take, make)),
+        vision=list(_vision_layers(config, take)),
         post_layernorm=take.affine("vision.post_layernorm"),
         projector=take.affine("projector"),
         embed_tokens=take("vlm.embed_tokens.weight"),
-        vlm=list(_gemma_layers(config, take, state, "vlm", make)),
-        expert=list(_gemma_layers(config, _Tensors(state, expert_device or device), state, "expert", _as_it_is)),
+        vlm=list(_gemma_layers(config, take, "prefix")),
+        expert=list(_gemma_layers(config, _Tensors(state, expert_device or device), "expert")),
         expert_norm=take.scale("expert.norm"),
         small={name: take(name) for name in list(state) if name.startswith(("action_", "state_proj."))},
         conditioning=conditioning,
     )
-    assert not state, f"tensors that the engine doesn't know: {sorted(state)}"
+    assert not state and not made, f"tensors that the engine doesn't know: {sorted({*state, *(made or {})})}"
     return weights
 
 
-def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Iterator[VisionLayer]:
+def _vision_layers(config: ModelConfig, take: _Tensors) -> Iterator[VisionLayer]:
     for i in range(config.vision.depth):
-        prefix = f"vision.layers.{i}"
-        projections = [f"{prefix}.self_attn.{p}" for p in QKV]
-
-        def matrix(kind: str, name: str, i: int = i, prefix: str = prefix) -> AffineMatrix:
-            weight, bias = take.affine(f"{prefix}.{name}")
-            return make(f"vision.{i}.{kind}", weight), bias
-
-        fc1, fc2 = _in_whole_lines(matrix("fc1", "mlp.fc1"), matrix("fc2", "mlp.fc2"))
+        prefix, matrix = f"vision.layers.{i}", partial(take.matrix, config, "vision", i)
+        fc1, fc2 = in_whole_lines(matrix("fc1"), matrix("fc2"))
+        fc1_bias = take(f"{prefix}.mlp.fc1.bias")
         yield VisionLayer(
             norm1=take.affine(f"{prefix}.layer_norm1"),
-            qkv=(
-                make(f"vision.{i}.qkv", take.joined([f"{p}.weight" for p in projections])),
-                take.joined([f"{p}.bias" for p in projections]),
-            ),
-            out=matrix("out", "self_attn.out_proj"),
+            qkv=(matrix("qkv"), take.joined([f"{prefix}.self_attn.{p}.bias" for p in QKV])),
+            out=(matrix("out"), take(f"{prefix}.self_attn.out_proj.bias")),
             norm2=take.affine(f"{prefix}.layer_norm2"),
-            fc1=fc1,
-            fc2=fc2,
+            fc1=(fc1, F.pad(fc1_bias, (0, fc1.shape[0] - len(fc1_bias)))),
+            fc2=(fc2, take(f"{prefix}.mlp.fc2.bias")),
         )
 
 
-def _in_whole_lines(fc1: AffineMatrix, fc2: AffineMatrix) -> tuple[AffineMatrix, AffineMatrix]:
-    """Both as they are; if both are in eight bits, with hidden columns of zeros up to whole lines of memory.
-
-    With SigLIP's 4,304 hidden columns seven rows of fc2 in eight begin inside a line, and fc2 takes 1.05 to 1.4 times
-    as long. GELU of 0 is 0, and 0 adds nothing.
-    """
-    (first, bias), (second, last_bias) = fc1, fc2
-    if not (isinstance(first, ScaledMatrix) and isinstance(second, ScaledMatrix)):
-        return fc1, fc2
-    (hidden, inner), columns = first.shape, second.shape[0]
-    if (wide := whole_lines(hidden)) == hidden:
-        return fc1, fc2
-    return (first.padded(wide, inner), F.pad(bias, (0, wide - hidden))), (second.padded(columns, wide), last_bias)
-
-
-def _gemma_layers(
-    config: ModelConfig,
-    take: _Tensors,
-    state: State,
-    stack: str,
-    make: Callable[[str, Tensor], AnyMatrix],
-) -> Iterator[GemmaLayer[AnyMatrix]]:
+def _gemma_layers(config: ModelConfig, take: _Tensors, part: Part) -> Iterator[GemmaLayer[Any]]:
     for i in range(config.vlm.depth):
-        prefix, place = f"{stack}.layers.{i}", f"prefix.{i}"
-        if stack == "vlm" and i + 1 == config.vlm.depth:  # nothing but its keys and values is ever used: 0.2 GB
-            for name in ("self_attn.o_proj", "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj"):
-                state[f"{prefix}.{name}.weight"] = state[f"{prefix}.{name}.weight"][:0].clone()
-        qkv = take.joined([f"{prefix}.self_attn.{p}.weight" for p in QKV])
-        gate_up = take.joined([f"{prefix}.mlp.{p}.weight" for p in GATE_UP])
+        prefix, matrix = f"{'vlm' if part == 'prefix' else part}.layers.{i}", partial(take.matrix, config, part, i)
         yield GemmaLayer(
-            qkv=make(f"{place}.qkv", qkv),
-            out=make(f"{place}.out", take(f"{prefix}.self_attn.o_proj.weight")),
-            gate_up=make(f"{place}.gate_up", gate_up),
-            down=make(f"{place}.down", take(f"{prefix}.mlp.down_proj.weight")),
+            qkv=matrix("qkv"),
+            out=matrix("out"),
+            gate_up=matrix("gate_up"),
+            down=matrix("down"),
             norm1=take.scale(f"{prefix}.input_layernorm"),
             norm2=take.scale(f"{prefix}.post_attention_layernorm"),
         )

@@ -18,6 +18,7 @@ from turbopi.backends.device_lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
+from turbopi.checkpoint.quantized_folder import precision_kept
 from turbopi.config import PolicyConfig, Solver, TimeGrid, memory_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
@@ -67,7 +68,7 @@ class UnifiedPolicy:
         backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`), and
             qualifies a GPU that it doesn't know, once, in at most a minute (docs/gpus.md).
         precision: "bf16", "f32", "int8-weights" for Pi0-FAST, or with a calibration "fp8", "fp8-mlp" or "int8"
-            (docs/quantization.md).
+            (docs/quantization.md). None: what the folder keeps its weights in, else bf16.
         quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
         num_denoising_steps: evaluations of the action expert in a call. None: the config's.
         solver: "euler", "midpoint", "heun", "ab2" or "exponential" (docs/performance.md). None: the config's.
@@ -101,7 +102,7 @@ class UnifiedPolicy:
         *,
         config: str | Path | PolicyConfig = "auto",
         backend: str = "auto",
-        precision: Precision = "bf16",
+        precision: Precision | None = None,
         quantization: str | Path | Quantization | None = None,
         num_denoising_steps: int | None = None,
         solver: Solver | None = None,
@@ -120,6 +121,7 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         known = None if known_cameras is None else KnownCameras.load(known_cameras)
+        precision = precision or precision_kept(checkpoint_dir) or "bf16"
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
         backends.check(name, self._device, precision)  # before a calibration is looked for, and weights are read

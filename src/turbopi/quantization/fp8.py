@@ -74,6 +74,13 @@ class ScaledMatrix:
     def __getitem__(self, rows: slice) -> "ScaledMatrix":
         return replace(self, data=self.data[rows], scale=self.scale[rows])
 
+    def to(self, device: torch.device) -> "ScaledMatrix":
+        return replace(self, data=self.data.to(device), scale=self.scale.to(device))
+
+    def for_input(self, scale: float) -> "ScaledMatrix":
+        """This matrix, of channels' scales alone, for an input with a scale."""
+        return replace(self, scale=self.scale * scale, inverse=1 / scale)
+
     def padded(self, rows: int, columns: int) -> "ScaledMatrix":
         """Padded with zeros to [rows, columns]; the scales of new rows are 1."""
         data, scale = self.data.new_zeros(rows, columns), self.scale.new_ones(rows)

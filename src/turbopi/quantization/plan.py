@@ -43,6 +43,11 @@ class PrecisionPlan:
         """The denoising kernel takes all of the expert's matrices in one precision: bf16 if any is to be kept so."""
         return "bf16" if any(name.startswith("expert.") for name in self.kept) else self.format.name
 
+    @property
+    def rounded(self) -> list[str]:
+        """The sites whose matrices are rounded: of the expert's all or none."""
+        return [site for site in self.scales if self.expert != "bf16" or not site.startswith("expert.")]
+
     def describe(self) -> dict[str, Any]:
         """Which sites run in what, by group, and why the others don't."""
         by_group: dict[str, dict[str, list[str]]] = {}

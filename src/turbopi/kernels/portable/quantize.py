@@ -5,18 +5,24 @@ import importlib.util
 from torch import Tensor
 
 from turbopi.quantization.formats import FP8, Format
-from turbopi.quantization.fp8 import Directions, ScaledMatrix, channel_scales
+from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, channel_scales
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 from turbopi.support.toolchain import make_caches_writable
 
 
 def quantize(
-    weight: Tensor, input_scale: float, directions: Directions | None = None, format: Format = FP8
+    weight: Matrix, input_scale: float, directions: Directions | None = None, format: Format = FP8
 ) -> ScaledMatrix:
     """weight [out, in] in its channels' own scales, rounded for its input's directions."""
+    return round_channels(weight, directions, format).for_input(input_scale)
+
+
+def round_channels(weight: Matrix, directions: Directions | None = None, format: Format = FP8) -> ScaledMatrix:
+    """The same with the channels' scales alone. A matrix that was rounded so before stays as it is."""
+    if isinstance(weight, ScaledMatrix):
+        return weight
     scale = channel_scales(weight, format.largest)
-    rounded = round_rows(weight, 1 / scale, directions, format)
-    return ScaledMatrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)
+    return ScaledMatrix(round_rows(weight, 1 / scale, directions, format), scale, 1.0, weight.dtype)
 
 
 def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = None, format: Format = FP8) -> Tensor:

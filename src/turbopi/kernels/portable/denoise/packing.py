@@ -12,7 +12,7 @@ from torch import Tensor
 
 from turbopi.config import GemmaConfig, ModelConfig
 from turbopi.kernels.interface import GemmaLayer
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.quantize import round_channels
 from turbopi.models import family_of
 from turbopi.quantization import sites
 from turbopi.quantization.formats import FP8, Format
@@ -165,7 +165,8 @@ class PackedExpert:
             parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             places = [f"expert.{i}.{kind}" for kind in KINDS]
             if inputs is not None:
-                made = [quantize(m, 1.0, (directions or {}).get(s), format) for m, s in zip(parts, places, strict=True)]
+                common = [(directions or {}).get(place) for place in places]
+                made = [round_channels(m, d, format) for m, d in zip(parts, common, strict=True)]
                 parts = [m.data if m.numbers == torch.int8 else m.data.view(torch.uint8) for m in made]
                 scales.append(torch.cat([matrix.scale for matrix in made]))
                 of_inputs.append([inputs[place] for place in places])

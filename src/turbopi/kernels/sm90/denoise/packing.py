@@ -15,7 +15,7 @@ from turbopi.config import ModelConfig
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.denoise.packing import KINDS as KINDS
 from turbopi.kernels.portable.denoise.packing import matrix_shapes
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.quantize import round_channels
 from turbopi.models import family_of
 from turbopi.quantization.fp8 import E4M3, Directions
 from turbopi.support.errors import BackendError
@@ -176,7 +176,7 @@ class PackedExpert:
             parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             if inputs is not None:
                 common = [(directions or {}).get(f"expert.{i}.{kind}") for kind in KINDS]
-                made = [quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
+                made = [round_channels(m, d) for m, d in zip(parts, common, strict=True)]
                 bits = [matrix.data.view(torch.uint8) for matrix in made]
                 scales.append(torch.cat([matrix.scale for matrix in made]))
             else:
