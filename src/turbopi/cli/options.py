@@ -218,8 +218,8 @@ class PolicyOptions(RobotOptions):
             "--precision",
             panel=_RUNNING,
             metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8",
-            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, what the "
-            "folder keeps its weights in, else bf16, or what --backend has instead.",
+            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, what "
+            "the folder keeps its weights in, else bf16, or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[
