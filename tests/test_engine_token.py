@@ -74,7 +74,7 @@ def test_int8_weights_are_what_is_multiplied(policy: UnifiedPolicy, name: str) -
     model.step(exact)
     assert (ours.logits - expected.logits).abs().max() <= 2e-5 * expected.logits.abs().max()
     error = (ours.logits - exact.logits).norm() / exact.logits.norm()
-    assert 1e-4 < error < 0.03, "a row's 255 steps are 0.008 of a normal variable's rms"
+    assert 1e-3 < error < 0.02, "a row's 255 steps are some 0.008 of a normal variable's rms"
 
 
 def meant(weight: Weight) -> Tensor:

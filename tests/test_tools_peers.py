@@ -138,16 +138,16 @@ def test_a_drivers_calls_of_a_part_end_with_its_time_but_three() -> None:
 
 def test_figures_are_told_after_each_round(fake: entries.Program) -> None:
     settings = [(replace(fake, name=name), "bf16", sys.executable, {"fault": fault}) for name, fault in FAULTS]
-    told: list[tuple[list[int], list[str]]] = []
+    seen: list[tuple[list[int], list[str]]] = []
     running.time_job(
         settings,
         JOB,
         rounds=3,
         calls=2,
         limits=LIMITS,
-        after_round=lambda timed, lost: told.append(([one.calls for one in timed], [one.program for one in lost])),
+        after_round=lambda timed, lost: seen.append(([one.calls for one in timed], [one.program for one in lost])),
     )
-    assert told == [([2, 2, 2, 2], ["c"]), ([4, 4], ["c", "b"]), ([6, 6], ["c", "b"])]
+    assert seen == [([2, 2, 2, 2], ["c"]), ([4, 4], ["c", "b"]), ([6, 6], ["c", "b"])]
 
 
 def test_programs_that_tune_themselves_get_ready_alone(fake: entries.Program, tmp_path: Path) -> None:

@@ -65,8 +65,8 @@ def serve(build: Callable[[dict[str, Any]], Built]) -> None:
     found = {name: installed for name in built.packages if (installed := _version(name))} | dict(built.sources)
     say({"ready": True, "note": built.note, "versions": found, "setup_s": round(time.perf_counter() - begin, 1)})
     for line in sys.stdin:
-        told = json.loads(line)
-        say({name: _times(part, told["calls"], told["seconds"]) for name, part in built.parts.items()})
+        request = json.loads(line)
+        say({name: _times(part, request["calls"], request["seconds"]) for name, part in built.parts.items()})
 
 
 def _times(part: Part, calls: int, seconds: float | None) -> dict[str, Any]:
