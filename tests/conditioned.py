@@ -10,12 +10,13 @@ from turbopi.models.pi0.conditioning import (
     guidance_strength,
     guidance_weights,
 )
+from turbopi.models.pi0.noise_choice import NoiseChoice
 
 BY_TOKEN = ["held", "identity", "held_and_identity", "staircase", "same_times", "warm_start"]
 
 
 def conditioned(which: str, steps: int, horizon: int, width: int, seed: int = 0) -> Conditioning:
-    """`which` is one of BY_TOKEN, or "jacobian", or "jacobian_and_held"."""
+    """`which` is one of BY_TOKEN, or "jacobian", "jacobian_and_held" or "chosen_noise"."""
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((horizon, width)).astype(np.float32)
     held = np.arange(horizon) < max(1, horizon // 3)
@@ -28,6 +29,8 @@ def conditioned(which: str, steps: int, horizon: int, width: int, seed: int = 0)
     plain = TokenTimes.plain(steps, horizon)
     if which == "held":
         return Conditioning(held=held, values=values)
+    if which == "chosen_noise":
+        return Conditioning(noise=NoiseChoice(held, values))
     if which == "identity":
         return Conditioning(guidance=guidance("identity", plain))
     if which == "held_and_identity":

@@ -112,7 +112,7 @@ class Loop:
 def started(execution: Any = "async", *, warm: bool = True, **options: Any) -> tuple[Loop, LinePolicy]:
     """A loop around a warm executor."""
     clock, hand = Clock(), ByHand()
-    modes = options.pop("modes", ("rtc", "rtc_identity", "rtc_trained", "warm_start"))
+    modes = options.pop("modes", ("rtc", "rtc_identity", "rtc_trained", "warm_start", "paint"))
     policy = LinePolicy(clock, horizon=options.pop("horizon", 10), seconds=options.pop("seconds", 0.0), modes=modes)
     executor = RealTimeExecutor(
         policy,

@@ -147,7 +147,7 @@ CANNOT = "was asked for, which this policy can't: it offers"
     [
         (
             ["--execution", "rtc_trained", "--control-hz", "50"],
-            f"--execution rtc_trained {CANNOT} ['rtc', 'rtc_identity', 'warm_start']. That mode is for checkpoints",
+            f"--execution rtc_trained {CANNOT} ['rtc', 'rtc_identity', 'warm_start', 'paint']. That mode is for check",
         ),
         ([*RTC, "--solver", "heun", "--steps", "6"], f"--execution rtc {CANNOT} ['warm_start']"),
         (

@@ -22,7 +22,7 @@ from turbopi.support.errors import ObservationError
 
 KINDS: list[Kind] = ["pi05", "pi0"]
 STEPS = 4
-FORMS = [*BY_TOKEN, "jacobian", "jacobian_and_held"]
+FORMS = [*BY_TOKEN, "jacobian", "jacobian_and_held", "chosen_noise"]
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -94,9 +94,10 @@ def test_rows_of_a_batch_have_conditionings_of_their_own(engine: OnCpu) -> None:
         engine.sample(both, noises, STEPS, conditioning=[None, None, None])
 
 
-def test_denoise_alone_takes_a_conditioning(engine: OnCpu) -> None:
+@pytest.mark.parametrize("which", ["held_and_identity", "chosen_noise"])
+def test_denoise_alone_takes_a_conditioning(engine: OnCpu, which: str) -> None:
     observation, noise = made_up(engine.config.kind, 1, 7)
-    requested = conditioned("held_and_identity", STEPS, 7, 32)
+    requested = conditioned(which, STEPS, 7, 32)
     whole = engine.sample(observation, noise, STEPS, conditioning=requested).actions
     cache = golden_model(engine.config.kind).prefix(observation)
     alone = engine.denoise(cache, noise, STEPS, conditioning=requested)
@@ -106,7 +107,7 @@ def test_denoise_alone_takes_a_conditioning(engine: OnCpu) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("which", ["plain", "ab2", "held_and_identity", "jacobian"])
+@pytest.mark.parametrize("which", ["plain", "ab2", "held_and_identity", "jacobian", "chosen_noise"])
 def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(kind: Kind, which: str) -> None:
     """Behind the given rows the engine's own cache is as it was allocated: NaN."""
     observation, noise = made_up(kind, 1, 5)
@@ -123,7 +124,7 @@ def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(ki
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian"])
+@pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian", "chosen_noise"])
 def test_bfloat16_is_as_close_to_float32_as_the_reference_is(which: str) -> None:
     case = golden_cases()["b_third_masked"]
     requested = conditioned(which, 10, case.noise.shape[1], case.noise.shape[2])
@@ -155,6 +156,21 @@ def test_a_strict_backend_refuses_a_form_that_is_not_warm_and_warm_up_prepares_i
         engine.sample(observation, noise, STEPS, conditioning=conditioned("staircase", STEPS, 7, 32))
 
 
+def test_warm_up_prepares_every_loop_of_a_chosen_noise_for_every_prompt() -> None:
+    engine = on_cpu(cls=Unrun)
+    for tokens in (5, 19):
+        observation, noise = made_up("pi05", 2, tokens)
+        if tokens == 5:
+            engine.warmup(observation, STEPS, 7)
+            engine.strict = True
+            with pytest.raises(ObservationError, match="strict: this call needs 2 cameras, H=7, 4 steps, by token"):
+                engine.sample(observation, noise, STEPS, conditioning=conditioned("chosen_noise", STEPS, 7, 32))
+            engine.warmup(observation, STEPS, 7, conditioning=conditioned("chosen_noise", STEPS, 7, 32, seed=1))
+        engine.reported.clear()
+        engine.sample(observation, noise, STEPS, conditioning=conditioned("chosen_noise", STEPS, 7, 32))
+        assert engine.reported == ["run", "answer", "denoise", "denoise"]
+
+
 def test_few_conditioned_loops_are_kept() -> None:
     engine = on_cpu(cls=Unrun)
     observation, noise = made_up("pi05", 2, 5)
@@ -182,4 +198,4 @@ def test_too_many_times_are_refused() -> None:
 
 
 def test_backends_say_which_forms_they_have() -> None:
-    assert set(on_cpu().forms) == {"solver", "tokens", "jacobian", "two_prompts"}
+    assert set(on_cpu().forms) == {"solver", "tokens", "jacobian", "noise", "two_prompts"}

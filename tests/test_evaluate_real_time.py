@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
 
 HZ, STEP = 20.0, 1 / 20
 TASK = Task(0, "count", "count", 10, 60)
-OFFERED = {"modes": ["rtc", "rtc_identity", "rtc_trained", "warm_start"], "trained_max_delay": 4}
+OFFERED = {"modes": ["rtc", "rtc_identity", "rtc_trained", "warm_start", "paint"], "trained_max_delay": 4}
 
 
 class Clock:

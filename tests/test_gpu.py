@@ -262,7 +262,7 @@ def test_tf32_stays_out_of_the_oracle_whatever_the_caller_has_set() -> None:
 
 @pytest.mark.parametrize(("name", "precision"), [mode for mode in MODES if mode[0] in GRAPHS])
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
-@pytest.mark.parametrize("which", [*BY_TOKEN, "jacobian", "jacobian_and_held"])
+@pytest.mark.parametrize("which", [*BY_TOKEN, "jacobian", "jacobian_and_held", "chosen_noise"])
 def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecision, kind: PiKind, which: str) -> None:
     """Plain calls beside them keep their bits."""
     runner: Any = backend(name, kind, precision)

@@ -256,7 +256,10 @@ def test_weights_of_one_step_have_no_warm_start(policy: UnifiedPolicy, monkeypat
 
 def test_metadata_says_what_can_be_joined(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
     said = policy.metadata["real_time"]
-    assert said["modes"] == ["rtc", "rtc_identity", "rtc_trained", "warm_start"] and said["trained_max_delay"] == 3
+    assert (
+        said["modes"] == ["rtc", "rtc_identity", "rtc_trained", "warm_start", "paint"]
+        and said["trained_max_delay"] == 3
+    )
     monkeypatch.setattr(type(policy.backend), "forms", ("tokens",))
     assert policy.metadata["real_time"]["modes"] == ["rtc_identity", "rtc_trained"]
 

@@ -76,7 +76,7 @@ def test_bfloat16_is_lerobots_own(folders: Path, hub: Path) -> None:
 
 def test_chunks_join_as_in_lerobot(folders: Path, hub: Path) -> None:
     policy, golden = UnifiedPolicy(folders / "rtc" / "checkpoint", precision="f32"), GoldenRuns("rtc")
-    assert policy.metadata["real_time"]["modes"] == ["rtc", "rtc_identity", "warm_start"]
+    assert policy.metadata["real_time"]["modes"] == ["rtc", "rtc_identity", "warm_start", "paint"]
     horizon, joined = policy.config.model.action_horizon, 0
     for run, one in enumerate(golden.described["runs"]):
         rtc = one["rtc"]

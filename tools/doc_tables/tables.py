@@ -127,8 +127,10 @@ def whole_calls(document: BenchDocument) -> list[str]:
 def joins(document: BenchDocument) -> list[str]:
     """`fused`: calls of conditioned chunks (`turbopi bench --join`), and in brackets how many times a plain call."""
     kinds = list(dict.fromkeys((one.precision, one.job.horizon) for one in document.results))
-    rows = []
+    rows, measured = [], {one.job.join for one in document.results}
     for join, name in JOINS.items():
+        if join not in measured:
+            continue
         row = [name or "plain"]
         for precision, horizon in kinds:
             calls = [_result(document, "fused", precision, horizon=horizon, join=one) for one in (join, "none")]

@@ -101,7 +101,7 @@ def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_step
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["kv_reuse", "fp8_and_fp4", "pipelining"])
+@pytest.mark.parametrize("name", ["kv_reuse", "fp8_and_fp4", "pipelining", "noise_choice"])
 def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_path: Path) -> None:
     result = turbopi("study", name, "--small", "--device", "cpu", "--out", tmp_path)
     assert result.exit_code == 0, result.output

@@ -161,7 +161,8 @@ class Backend(ABC):
                 f"backend {cls.name!r} has no guidance by the true Jacobian (rtc) together with guidance by a second "
                 "prompt; take mode rtc_identity or rtc_trained, guidance 1 or 0, or backend 'pytorch'"
             )
-        what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+        whats = {"jacobian": "guidance by the true Jacobian", "noise": "chosen noise (paint)"}
+        what = whats.get(form, "times, held actions or guidance by token")
         return (
             f"backend {cls.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
             "leave out conditioning and previous"

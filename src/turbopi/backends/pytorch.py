@@ -25,7 +25,7 @@ class PyTorchBackend(Backend):
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
-    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "two_prompts", "two_prompts_jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "noise", "two_prompts", "two_prompts_jacobian")
     writes: ClassVar[bool] = True
     model_class: ClassVar[type[Pi0Model] | None] = None
     _warm = False

@@ -17,6 +17,7 @@ from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization, PolicyConfig, Solver, TimeGrid
 from turbopi.models import family_of
 from turbopi.models.pi0.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
+from turbopi.models.pi0.noise_choice import NoiseChoice
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
@@ -117,6 +118,8 @@ def conditioning(policy: UnifiedPolicy, job: Job) -> Conditioning | None:
     target = np.random.default_rng(0).standard_normal((horizon, model.action_dim), dtype=np.float32)
     if job.join == "held":
         return Conditioning(held=np.arange(horizon) < delay, values=target)
+    if job.join == "paint":
+        return Conditioning(noise=NoiseChoice(np.arange(horizon) < delay, target))
     times = TokenTimes.plain(job.steps, horizon, model.time_grid).times
     weights = guidance_weights(horizon, delay, delay)
     return Conditioning(guidance=Guidance(target, weights, guidance_strength(times, 5.0), job.join))

@@ -12,12 +12,13 @@ from turbopi.config import GemmaConfig, ModelConfig, Network
 from turbopi.models import family_of
 
 _Count = Annotated[int, Meta(ge=1)]
-Join = Literal["none", "held", "identity", "jacobian"]
+Join = Literal["none", "held", "identity", "jacobian", "paint"]
 JOINS: dict[Join, str] = {  # how a chunk joins a running one (docs/real_time.md), and what the table calls it
     "none": "",
     "held": "the first actions fixed",
     "identity": "guided by the identity",
     "jacobian": "guided by the Jacobian",
+    "paint": "its noise chosen",
 }
 MODEL_SIZE = (224, 224)  # width and height of the images that the model reads
 

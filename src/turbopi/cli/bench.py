@@ -184,8 +184,8 @@ def bench(
         str | None,
         typer.Option(
             metavar="NAME,NAME,…",
-            help="Chunks that join a running one (docs/real_time.md): none, held (a quarter of the actions), or guided "
-            "by identity or jacobian.",
+            help="Chunks that join a running one (docs/real_time.md): none, held (a quarter of the actions), guided by "
+            "identity or jacobian, or paint.",
         ),
     ] = None,
     calls: Annotated[

@@ -40,12 +40,12 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     requested = Denoising.of(checkpoint.config, *fitting.flow_arguments)
     no_pipeline: Any = None  # no observation is read
     own = requested.integration, requested.two_prompts
-    modes = ChunkConditioning(checkpoint.config, no_pipeline, cls, *own).modes
+    joins = ChunkConditioning(checkpoint.config, no_pipeline, cls, *own)
     batches = cls.runs_batches and requested.runs_together
     return Capabilities(
-        real_time={"modes": list(modes), **asdict(checkpoint.config.real_time)},
+        real_time={"modes": list(joins.modes), **asdict(checkpoint.config.real_time)},
         pipelined=cls.submits,
-        batch_modes=modes if batches else (),
+        batch_modes=joins.batch_modes if batches else (),
     )
 
 

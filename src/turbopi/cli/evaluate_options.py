@@ -73,7 +73,7 @@ class EvalOptions(PolicyOptions):
             "--execution",
             panel=_DELAY,
             metavar="WAY,WAY,…",
-            help="How chunks join: sync, async, ensemble, rtc, rtc_identity, rtc_trained, warm_start.",
+            help="How chunks join: sync, async, ensemble, rtc, rtc_identity, rtc_trained, warm_start, paint.",
         ),
     ] = "sync"
     delay_steps: Annotated[

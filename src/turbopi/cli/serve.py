@@ -169,8 +169,8 @@ def serve(
             "--execution",
             rich_help_panel=_REAL_TIME,
             metavar="WAY",
-            help="Join each client's chunks, the client unchanged: rtc, rtc_identity, rtc_trained or warm_start, with "
-            "--control-hz. See docs/real_time.md",
+            help="Join each client's chunks, the client unchanged: rtc, rtc_identity, rtc_trained, warm_start or "
+            "paint, with --control-hz. See docs/real_time.md",
         ),
     ] = None,
     control_hz: Annotated[

@@ -25,7 +25,8 @@ from turbopi.engine.call import Images
 from turbopi.engine.graph_cache import Captured
 from turbopi.engine.loops import Loop, batch_form, loop_of_batch
 from turbopi.engine.plan import GraphKey, split
-from turbopi.engine.runner import GraphRunner, HostRow, floats, padded_trace
+from turbopi.engine.runner import GraphRunner, HostRow, floats
+from turbopi.engine.trace import padded_trace
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
 from turbopi.models.observation import Observation
@@ -115,7 +116,7 @@ class BatchRunner(GraphRunner):
         """See `turbopi.backends.base.Backend`."""
         cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
         form, actions = batch_form(conditioning), self.config.action_horizon if horizon is None else horizon
-        if form in ("solver", "two_prompts"):  # they run alone
+        if form in plan.ALONE:
             return
         loop = loop_of_batch([conditioning], num_steps, actions, self.config)
         self._check_cameras(cameras)
@@ -278,8 +279,8 @@ class BatchRunner(GraphRunner):
             return [(1, [0])]
         calls: list[Call] = []
         for form, rows in plan.groups(forms):
-            if form in ("solver", "two_prompts"):
-                calls += [(1 if form == "solver" else 0, [row]) for row in rows]
+            if form in plan.ALONE:
+                calls += [(0 if form == "two_prompts" else 1, [row]) for row in rows]
                 continue
             for size in self._split(len(rows), form):
                 calls.append((size, rows[:size]))

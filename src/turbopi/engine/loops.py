@@ -120,6 +120,8 @@ def loop_of_call(
 ) -> Loop:
     """The loop of one observation's call, by one prompt or two. Raises ObservationError for one that doesn't fit.
 
+    A call whose noise is chosen has several: those of its `passes`.
+
     A conditioned loop with the config's own grid of times, and 0, serves all calls that have no others, whichever
     actions are held.
 
@@ -140,7 +142,7 @@ def loop_of_call(
 
 
 def batch_form(conditioning: Conditioning | None) -> Form:
-    """What an observation with this conditioning needs of a batched loop. "solver", "two_prompts": it runs alone."""
+    """What an observation with this conditioning needs of a batched loop; see `plan.ALONE`."""
     if conditioning is None:
         return "plain"
     form, integration = conditioning.form, conditioning.integration
@@ -150,12 +152,12 @@ def batch_form(conditioning: Conditioning | None) -> Form:
 def loop_of_batch(
     conditionings: Sequence[Conditioning | None], num_steps: int, horizon: int, config: ModelConfig
 ) -> EulerLoop | ConditionedLoop:
-    """The loop of observations that run together, none of the form "solver", all checked.
+    """The loop of observations that run together, all checked.
 
     Its times are those of all observations, and openpi's, so that plain observations fit it.
     """
     forms = {batch_form(one) for one in conditionings}
-    assert not forms & {"solver", "two_prompts"}, "they have other sums"
+    assert not forms & {"solver", "noise", "two_prompts"}, "they run alone"
     if forms == {"plain"}:
         return EulerLoop(num_steps, horizon)
     own = _own_times(num_steps, config.time_grid)

@@ -1,9 +1,10 @@
 """Which CUDA graphs there are for which calls: names and sizes alone, no tensors and no GPU.
 
 One observation's call is two graphs, "vision" of so many cameras, which starts before the prompt is known, and
-"answer", prefix and all denoising steps, for a bucket of prompt lengths. A batched call is three: "vision", "prefix"
-and "denoise". Its rows are packed, so its sizes are sums over its observations. "resized" is vision of images of any
-size. Nothing is captured anew when images, prompt, state or noise change.
+"answer", prefix and all denoising steps, for a bucket of prompt lengths; where noise is chosen, "denoise" of the same
+bucket twice behind it. A batched call is three: "vision", "prefix" and "denoise". Its rows are packed, so its sizes are
+sums over its observations. "resized" is vision of images of any size. Nothing is captured anew when images, prompt,
+state or noise change.
 
 A call of one observation with two prompts is a batched call of two observations that have the same images.
 """
@@ -18,6 +19,7 @@ from turbopi.support.errors import ObservationError
 
 BUCKET = 16  # prompt tokens: at most 15 padded rows beside 256 a camera
 MAX_CAMERAS = 4  # the cache is allocated for them
+ALONE: tuple[Form, ...] = ("solver", "noise", "two_prompts")  # an observation with such a loop shares no call
 Part = Literal["vision", "resized", "answer", "prefix", "denoise"]
 
 
@@ -70,8 +72,12 @@ def warm_graphs(
     *,
     resizes: bool,
     two_prompts: bool = False,
+    again: Sequence[Loop] = (),
 ) -> Iterator[GraphKey]:
-    """What warm-up captures for a call of so many observations, for prompts of every length up to `most_tokens`."""
+    """What warm-up captures for a call of so many observations, for prompts of every length up to `most_tokens`.
+
+    again  loops that one observation's call runs behind its own, on the same prefix
+    """
     sizes = (batch, images, float_images)
     yield GraphKey("vision", *sizes)
     if resizes:
@@ -80,6 +86,7 @@ def warm_graphs(
     slots = range(step, batch_slots(batch, [most_tokens] * batch) + 1, step)
     if batch == 1:
         yield from (GraphKey("answer", *sizes, one, loop) for one in slots)
+        yield from (GraphKey("denoise", *sizes, one, other) for other in again for one in slots)
     else:
         yield from (GraphKey("prefix", *sizes, one, two_prompts=two_prompts) for one in slots)
         yield GraphKey("denoise", *sizes, loop=loop, two_prompts=two_prompts)
@@ -89,12 +96,12 @@ def groups(forms: Sequence[Form]) -> Iterator[tuple[Form, list[int]]]:
     """Which observations may share calls, and the form of their loop.
 
     Those with times, held actions or identity guidance by token run together with plain ones; those guided by the true
-    Jacobian together with each other; those with another solver's sums, or two prompts, alone.
+    Jacobian together with each other; those that are ALONE, alone.
     """
     by_token = [row for row, form in enumerate(forms) if form in ("plain", "tokens")]
     if by_token:
         yield "tokens" if "tokens" in forms else "plain", by_token
-    for form in ("jacobian", "solver", "two_prompts"):
+    for form in ("jacobian", *ALONE):
         if rows := [row for row, one in enumerate(forms) if one == form]:
             yield form, rows
 

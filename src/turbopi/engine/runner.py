@@ -24,6 +24,7 @@ from turbopi.engine.graph_cache import Captured, GraphCache
 from turbopi.engine.loops import EulerLoop, Loop, Table, loop_of_call
 from turbopi.engine.plan import MAX_CAMERAS, GraphKey, bucket
 from turbopi.engine.solving import solving
+from turbopi.engine.trace import golden_trace
 from turbopi.engine.weights import Weights, modulation_at
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.models.observation import Observation
@@ -69,8 +70,8 @@ class Begun:
         conditioning: Conditioning | None = None,
     ) -> Sample:
         """Its actions: `turbopi.backends.base.BegunBatch` of one observation, given without the axis of the batch."""
-        graph, call = self._runner._replay(self, "answer", tokens, state, noise, num_steps, conditioning)
-        return Sample(torch.from_numpy(call.actions_array[None].copy()), graph.stage_ms())
+        call, stages = self._runner._answer(self, tokens, state, noise, num_steps, conditioning)
+        return Sample(torch.from_numpy(call.actions_array[None].copy()), stages)
 
 
 class GraphRunner:
@@ -80,7 +81,7 @@ class GraphRunner:
     """
 
     name: ClassVar[str]
-    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "two_prompts")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian", "noise", "two_prompts")
     strict = False
 
     def __init__(
@@ -117,14 +118,17 @@ class GraphRunner:
         self._check_cameras(cameras)
         actions = self.config.action_horizon if horizon is None else horizon
         two = conditioning is not None and conditioning.prompt is not None
-        self._warm(2 if two else 1, cameras, float_images, self._loop(conditioning, num_steps, actions), two)
+        ahead, back = self._passes(conditioning, num_steps, actions)
+        loop, *others = (self._loop(one, num_steps, actions) for one in ([ahead] if back is None else [ahead, back]))
+        again = (loop, *others) if others else ()
+        self._warm(2 if two else 1, cameras, float_images, loop, two_prompts=two, again=again)
 
-    def _warm(self, batch: int, images: int, float_images: bool, loop: Loop, two_prompts: bool = False) -> None:
+    def _warm(self, batch: int, images: int, float_images: bool, loop: Loop, **options: Any) -> None:
         resizes, most = self._ops.resize_images is not None, self.config.max_prompt_tokens
         self._warming = True
         try:
             sizes = batch, images, float_images, loop, most
-            for key in plan.warm_graphs(*sizes, resizes=resizes, two_prompts=two_prompts):
+            for key in plan.warm_graphs(*sizes, resizes=resizes, **options):
                 self._graph(key)
         finally:
             self._warming = False
@@ -254,6 +258,52 @@ class GraphRunner:
         self._begun = None
         return graph, call
 
+    def _answer(
+        self,
+        begun: Begun,
+        tokens: np.ndarray,
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditioning | None,
+    ) -> tuple[StaticCall, dict[str, float]]:
+        """Run one row's whole call: the buffers that have its actions, and its stages' times."""
+        ahead, back = self._passes(conditioning, num_steps, len(noise))
+        graph, first = self._replay(begun, "answer", tokens, state, noise, num_steps, ahead)
+        stages = graph.stage_ms()
+        if conditioning is None or conditioning.noise is None:
+            return first, stages
+        shape = first.shape
+
+        def denoised(x: Tensor, one: Conditioning | None) -> StaticCall:
+            """From the prefix that is in the cache."""
+            loop = self._loop(one, num_steps, len(noise))
+            graph, call = self._graph(
+                GraphKey("denoise", 1, shape.cameras, shape.float_images, shape.prompt_slots, loop)
+            )
+            call.host.length.copy_(first.host.length)
+            call.inputs.length.copy_(first.inputs.length)
+            call.inputs.state.copy_(first.inputs.state)
+            call.inputs.noise.copy_(torch.from_numpy(call.started(x.numpy(), one)))
+            graph.replay()
+            stages["denoise"] += graph.stage_ms()["denoise"]
+            return call
+
+        def loop(x: Tensor, backwards: bool) -> Tensor:
+            return torch.from_numpy((denoised(x, back) if backwards else first).actions_array.copy())
+
+        with self._explaining():
+            return denoised(conditioning.noise.chosen(torch.from_numpy(noise), loop), ahead), stages
+
+    def _passes(
+        self, conditioning: Conditioning | None, num_steps: int, horizon: int
+    ) -> tuple[Conditioning | None, Conditioning | None]:
+        """What the loop is asked for, and where noise is chosen, the loop back. Raises ObservationError."""
+        if conditioning is None or conditioning.noise is None:
+            return conditioning, None
+        conditioning.check(num_steps, horizon, self.config.action_dim)
+        return conditioning.passes(num_steps, horizon, self.config.time_grid)
+
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
@@ -331,6 +381,14 @@ class GraphRunner:
         self._check_tokens(cameras, length - cameras * per_image)
         one = of_rows(conditioning, 1)[0]
         self._check_one_prompt(one)
+        ahead, back = self._passes(one, num_steps, noise.shape[1])
+        if one is not None and one.noise is not None:
+
+            def run(x: Tensor, backwards: bool) -> Tensor:
+                return self.denoise(cache, x, num_steps, conditioning=back if backwards else ahead)
+
+            noise = one.noise.chosen(noise.to(self.device), run)
+        one = ahead
         loop = self._loop(one, num_steps, noise.shape[1])
         graph, call = self._graph(GraphKey("denoise", 1, cameras, False, bucket(length - cameras * per_image), loop))
         for ours, given in ((call.cache_k, cache.k), (call.cache_v, cache.v)):
@@ -347,7 +405,7 @@ class GraphRunner:
         traces = []
         for b, one in enumerate(of_rows(conditioning, observation.batch_size)):
             row, x_1 = HostRow.of(observation, b), noise[b].cpu().numpy()
-            _, call = self._replay(self.begin(row.images), "answer", row.tokens, row.state, x_1, num_steps, one)
+            call, _ = self._answer(self.begin(row.images), row.tokens, row.state, x_1, num_steps, one)
             traces.append(golden_trace(call, int(call.host.length[0]), self._valid(observation, b)))
         return {name: torch.cat([one[name] for one in traces], dim=int(name != "actions")) for name in traces[0]}
 
@@ -369,25 +427,3 @@ def floats(images: Sequence[np.ndarray], resize: ImageResize | None) -> bool:
     if not images:
         return False
     return bool(images[0].dtype == np.float32) if resize is None else resize != "openpi"
-
-
-def golden_trace(call: Any, length: int, valid: Tensor) -> Trace:
-    """A call's intermediates in golden layouts: its `length` cache rows go back to the slots in `valid` bool[S]."""
-    return padded_trace(call.cache_k[:, :length], call.cache_v[:, :length], call.x_t, call.v_t, valid)
-
-
-def padded_trace(k: Tensor, v: Tensor, x_t: Tensor, v_t: Tensor, valid: Tensor) -> Trace:
-    """One observation's intermediates in golden layouts: k, v [layer, length, K], x_t [N + 1, H, A], v_t [N, H, A]."""
-
-    def padded(x: Tensor) -> Tensor:  # -> [layer, 1, S, 1, K]
-        out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
-        out[:, valid] = x.float().cpu()
-        return out[:, None, :, None]
-
-    return {
-        "kv_k": padded(k),
-        "kv_v": padded(v),
-        "x_t": x_t[:, None].clone(),
-        "v_t": v_t[:, None].clone(),
-        "actions": x_t[-1:].clone(),
-    }

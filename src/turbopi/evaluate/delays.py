@@ -25,7 +25,9 @@ from turbopi.support.reading import plain_document, read_document
 
 FORMAT: Final = 1
 FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "delays.png", "seams.png"
-COLORS = dict(zip(WAYS, ("#9aa0a6", "#b00020", "#e08a00", "#3b6fb6", "#7b4fb6", "#2f8f5b", "#7a5c3e"), strict=True))
+COLORS = dict(
+    zip(WAYS, ("#9aa0a6", "#b00020", "#e08a00", "#3b6fb6", "#7b4fb6", "#2f8f5b", "#7a5c3e", "#c2569b"), strict=True)
+)
 
 
 @dataclass(frozen=True)

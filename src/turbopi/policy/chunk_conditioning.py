@@ -19,6 +19,7 @@ from turbopi.models.pi0.conditioning import (
     guidance_strength,
     row_named,
 )
+from turbopi.models.pi0.noise_choice import NoiseChoice
 from turbopi.models.pi0.solvers import Integration
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.realtime.running_chunk import FORMS, WARM_START, JoinMode, RunningChunk
@@ -51,7 +52,7 @@ class Joins:
     def _form(self, conditioning: Conditioning | None, chunk: RunningChunk | None) -> Form:
         if chunk is None:
             return batch_form(conditioning)
-        if chunk.mode == "rtc_trained" and chunk.delay == 0:  # nothing is held
+        if chunk.mode in ("rtc_trained", "paint") and chunk.delay == 0:  # nothing is held or chosen
             return batch_form(integrated(None, self.integration))
         if chunk.mode == "warm_start":
             return batch_form(Conditioning(integration=warmed(self.integration, self.steps)))
@@ -85,10 +86,17 @@ class ChunkConditioning:
         able, trained = set(self._backend.forms), self._config.real_time.trained_max_delay > 0
         if self._two_prompts and "two_prompts_jacobian" not in able:
             able.discard("jacobian")
+        if self._two_prompts:
+            able.discard("noise")
         if self._integration is not None and not self._integration.is_euler:
             able &= {"solver"}  # see `Conditioning`
         lacking = {"rtc_trained": not trained, "warm_start": self._config.one_step}
         return tuple(mode for mode, form in FORMS.items() if form in able and not lacking.get(mode, False))
+
+    @property
+    def batch_modes(self) -> tuple[JoinMode, ...]:
+        """Those of which several observations run together, on a backend that runs batches."""
+        return tuple(mode for mode in self.modes if FORMS[mode] != "noise")
 
     def checked(
         self,
@@ -113,8 +121,13 @@ class ChunkConditioning:
                     rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
                     if joins.two_prompts and conditioning is not None and conditioning.prompt is not None:
                         raise ObservationError("guidance was given twice, by the conditioning and by a scale: give one")
-                    jacobian = joins.two_prompts and joins._form(*rows[i]) == "jacobian"
-                    self._check_form("two_prompts_jacobian" if jacobian else "plain")
+                    form = joins._form(*rows[i]) if joins.two_prompts else "plain"
+                    self._check_form("two_prompts_jacobian" if form == "jacobian" else "plain")
+                    if form == "noise":
+                        raise ObservationError(
+                            "mode paint chooses noise for one prompt, but guidance takes two: take another mode, or "
+                            "guidance 0 or 1"
+                        )
         return replace(joins, rows=rows)
 
     def _checked(
@@ -298,5 +311,7 @@ def _example(form: Form, num_steps: int, horizon: int, model: Network) -> Condit
     nothing = np.zeros((horizon, model.action_dim), np.float32)
     if form == "tokens":
         return Conditioning(held=np.arange(horizon) < 1, values=nothing)
+    if form == "noise":
+        return Conditioning(noise=NoiseChoice(np.arange(horizon) < 1, nothing))
     weights, strength = np.zeros(horizon, np.float32), np.zeros((num_steps, horizon), np.float32)
     return Conditioning(guidance=Guidance(nothing, weights, strength))

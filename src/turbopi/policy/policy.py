@@ -564,7 +564,7 @@ class UnifiedPolicy:
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:
         """Modes of `RunningChunk`s with which `infer_batch` runs observations together."""
-        return self._conditioning.modes if self.runs_batches else ()
+        return self._conditioning.batch_modes if self.runs_batches else ()
 
     @property
     def loop_arguments(self) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class RealTimeExecutor:
     policy             a UnifiedPolicy, turbopi.realtime.RealTimeClient, openpi's WebsocketClientPolicy, or whatever has
                        `infer(observation)`. The executor alone calls it, on a thread of its own
     control_hz         how often the control loop calls `next_action`, times a second
-    execution          "sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained" or "warm_start"
+    execution          "sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained", "warm_start" or "paint"
     execution_horizon  actions of a chunk after which the next observation is used. None: half of a chunk
     on_empty           what happens when the policy is late and there is no action for a step
                          "hold"       `next_action` gives a command of kind "held", with `hold_action`

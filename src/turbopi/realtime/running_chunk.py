@@ -11,12 +11,13 @@ from turbopi.support.errors import ObservationError
 if TYPE_CHECKING:  # a robot's computer joins chunks without PyTorch
     from turbopi.models.pi0.conditioning import Conditioning, Form
 
-JoinMode = Literal["rtc", "rtc_identity", "rtc_trained", "warm_start"]
+JoinMode = Literal["rtc", "rtc_identity", "rtc_trained", "warm_start", "paint"]
 FORMS: "dict[JoinMode, Form]" = {
     "rtc": "jacobian",
     "rtc_identity": "tokens",
     "rtc_trained": "tokens",
     "warm_start": "solver",
+    "paint": "noise",
 }
 WARM_START = 0.6  # t at which a warm start begins: so much noise, and the rest is the running chunk
 
@@ -38,7 +39,9 @@ class RunningChunk:
     mode               "rtc": guided, with the true Jacobian (arXiv 2506.07339). "rtc_identity": guided as LeRobot 0.6
                        computes it. "rtc_trained": the first d actions are held (arXiv 2512.05964), for checkpoints
                        that were trained so. "warm_start": denoising begins with the left-over, 60 % of it replaced by
-                       noise, and its last action in place of what is missing; nothing is held or pulled
+                       noise, and its last action in place of what is missing; nothing is held or pulled.
+                       "paint": the noise of the first d actions is chosen so that they come near the left-over's (arXiv
+                       2606.19774); with a delay of 0 an ordinary call
     anchor             for relative actions: the "anchor" that came with the left-over, so that it can be moved to the
                        new state
     schedule, max_guidance_weight
@@ -124,13 +127,16 @@ class RunningChunk:
             guidance_weights,
             lerobot_guidance_weights,
         )
+        from turbopi.models.pi0.noise_choice import NoiseChoice
 
         assert self.execution_horizon is not None and self.schedule is not None and self.max_guidance_weight is not None
         target = np.zeros((horizon, left_over.shape[1]), np.float32)
         target[: len(left_over)] = left_over
+        due = np.arange(horizon) < self.delay
+        if self.mode == "paint":
+            return Conditioning(noise=NoiseChoice(due, target)) if self.delay else Conditioning()
         if self.mode == "rtc_trained":
-            held = np.arange(horizon) < self.delay
-            return Conditioning(held=held, values=target) if self.delay else Conditioning()
+            return Conditioning(held=due, values=target) if self.delay else Conditioning()
         times = Conditioning().token_times(num_steps, horizon, time_grid).times
         rows, s = len(left_over), self.execution_horizon
         if self.mode == "rtc":  # nothing pulls towards what isn't there

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from turbopi.realtime.running_chunk import JoinMode
 from turbopi.support.errors import ConfigError
 
-Execution = Literal["sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained", "warm_start"]
+Execution = Literal["sync", "async", "ensemble", "rtc", "rtc_identity", "rtc_trained", "warm_start", "paint"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ WAYS: dict[str, Way] = {
     "rtc_identity": Way("rtc_identity", mode="rtc_identity"),
     "rtc_trained": Way("rtc_trained", mode="rtc_trained"),
     "warm_start": Way("warm_start", mode="warm_start"),
+    "paint": Way("paint", mode="paint"),
 }
 assert tuple(WAYS) == get_args(Execution)
 

@@ -19,7 +19,7 @@ MAX_BATCH = 64
 MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever
 MAX_CONTROL_HZ = 10_000.0
 OPENTELEMETRY = ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http")  # of the extra `otel`
-JOINING = ("rtc", "rtc_identity", "rtc_trained", "warm_start")
+JOINING = ("rtc", "rtc_identity", "rtc_trained", "warm_start", "paint")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class ServerOptions:
     max_clients     connected at once; more are refused with HTTP 503
     page            the server's own page and its feed. None: on if only this machine or who has the key can see it
     execution       join each client's chunks here, in a session of each connection: "rtc", "rtc_identity",
-                    "rtc_trained" or "warm_start". None: only for clients that request it (docs/serving_sessions.md)
+                    "rtc_trained", "warm_start" or "paint". None: only for clients that request it
+                    (docs/serving_sessions.md)
     control_hz      actions that robots carry out in a second; needed with `execution`
     execution_horizon
                     s, actions of a chunk that robots carry out before the next takes over. None: half of a chunk

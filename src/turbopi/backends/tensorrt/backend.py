@@ -29,7 +29,7 @@ from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.graph_cache import LoopCache
 from turbopi.engine.loops import EulerLoop, Loop
 from turbopi.engine.plan import cold_call
-from turbopi.engine.runner import golden_trace
+from turbopi.engine.trace import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings

@@ -10,6 +10,7 @@ t = 0 the action. One call of the loop, for every action i and step s:
 
 A held action has its given value in x from the start, time 0 and a step of 0: so it stays, and the others attend to it.
 With a solver other than Euler's the last line is another one, and the same for all actions: models/pi0/solvers.py.
+With a noise to choose the loop runs three times: models/pi0/noise_choice.py.
 """
 
 import math
@@ -24,14 +25,15 @@ from torch import Tensor
 from turbopi.config import MOST_GUIDANCE
 from turbopi.config import Schedule as Schedule
 from turbopi.models.pi0.denoise import time_grid
+from turbopi.models.pi0.noise_choice import NoiseChoice
 from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import ObservationError
 from turbopi.support.reading import is_finite, shown
 
 GuidanceMode = Literal["jacobian", "identity"]
 # What a backend must be able to do: a solver or a time grid of its own; times, steps and values by token, identity
-# guidance among them; the true Jacobian; a second prompt, with all of these but the Jacobian, and with it.
-Form = Literal["plain", "solver", "tokens", "jacobian", "two_prompts", "two_prompts_jacobian"]
+# guidance among them; the true Jacobian; a chosen noise; a second prompt, with "tokens", and with "jacobian".
+Form = Literal["plain", "solver", "tokens", "jacobian", "noise", "two_prompts", "two_prompts_jacobian"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class TokenTimes:
     """Where each action is in time at each step, and how far the step takes it."""
 
     times: np.ndarray  # float32[N, H]  t at the start of a step
-    steps: np.ndarray  # float32[N, H]  added to t in that step, so never above 0; 0: the action stays as it is
+    steps: np.ndarray  # float32[N, H]  added to t in that step: below 0, but in `reversed`; 0: the action stays
 
     @classmethod
     def plain(cls, num_steps: int, horizon: int, kind: str = "accumulated") -> "TokenTimes":
@@ -74,6 +76,11 @@ class TokenTimes:
     def holding(self, held: np.ndarray) -> "TokenTimes":
         """The same with the actions of `held` bool[H] at time 0 in every step."""
         return TokenTimes(np.where(held, np.float32(0), self.times), np.where(held, np.float32(0), self.steps))
+
+    def reversed(self) -> "TokenTimes":
+        """From actions, at t = 0, back to the first time, by the same steps: each from the point at which it ended."""
+        ends = np.concatenate((self.times[1:], np.zeros_like(self.times[:1])))
+        return TokenTimes(ends[::-1].copy(), -self.steps[::-1].copy())
 
     def distinct(self) -> np.ndarray:
         """float32[U]: the times that occur, each once, in the order in which they first do."""
@@ -149,7 +156,8 @@ class Conditioning:
     from, mixed with noise. Held actions' values replace its rows. With an `integration` it is x at its first time.
 
     Held actions and guidance go with Euler's steps, on any grid. Other solvers take neither: what they go on with is
-    made of several velocities, and an action that is held or pulled has none of them.
+    made of several velocities, and an action that is held or pulled has none of them. A `noise` goes with Euler's steps
+    on any grid, and with nothing else.
     """
 
     tokens: TokenTimes | None = None
@@ -158,6 +166,7 @@ class Conditioning:
     guidance: Guidance | None = None
     integration: Integration | None = None  # in place of `tokens`: a solver, and one grid of times for all actions
     prompt: PromptGuidance | None = None
+    noise: NoiseChoice | None = None
 
     @property
     def one_prompt(self) -> "Conditioning":
@@ -169,6 +178,8 @@ class Conditioning:
         """What a backend must be able to do. "plain": nothing beside openpi's loop."""
         if self.prompt is not None:
             return "two_prompts_jacobian" if self.one_prompt.form == "jacobian" else "two_prompts"
+        if self.noise is not None:
+            return "noise"
         if self.guidance is not None and self.guidance.mode == "jacobian":
             return "jacobian"
         holds = self.held is not None and bool(np.any(self.held))
@@ -188,7 +199,13 @@ class Conditioning:
         if grid is not None:
             return int(grid.shape[0]), int(grid.shape[1])
         steps = num_steps if self.integration is None else self.integration.evaluations
-        return steps, horizon if self.held is None else len(self.held)
+        rows = self.held if self.noise is None else self.noise.rows
+        return steps, horizon if rows is None else len(rows)
+
+    def passes(self, num_steps: int, horizon: int, kind: str) -> "tuple[Conditioning, Conditioning]":
+        """The loops of a `noise`: to actions, and back. `kind` as in `time_grid`."""
+        there = replace(self, noise=None)
+        return there, Conditioning(tokens=there.token_times(num_steps, horizon, kind).reversed())
 
     def own_tokens(self, horizon: int) -> TokenTimes | None:
         """Times and steps that it brings; None: openpi's."""
@@ -210,6 +227,8 @@ class Conditioning:
         grid, chunk = (num_steps, horizon), (horizon, action_dim)
         if self.prompt is not None:
             self.prompt.check()
+        if self.noise is not None:
+            self._check_noise(self.noise, horizon, chunk)
         if self.integration is not None:
             self._check_integration(self.integration, num_steps)
         if self.tokens is not None:
@@ -219,8 +238,7 @@ class Conditioning:
                 raise ObservationError("token times should lie between 0 (action) and 1 (noise), in every step")
         if self.held is not None:
             held = self.held
-            if not isinstance(held, np.ndarray) or held.dtype != np.bool_ or held.shape != (horizon,):
-                raise ObservationError(f"held is {_described(held)}; it should be bool of shape {[horizon]}")
+            _check_mask("held", held, horizon)
             if held.any() and self.values is None:
                 raise ObservationError("held actions need values: float32[H, action_dim], read where held is true")
             if self.values is not None:
@@ -231,6 +249,19 @@ class Conditioning:
             _check("the guidance's target", self.guidance.target, chunk)
             _check("the guidance's weights", self.guidance.weights, (horizon,))
             _check("the guidance's strength", self.guidance.strength, grid)
+
+    def _check_noise(self, noise: NoiseChoice, horizon: int, chunk: tuple[int, int]) -> None:
+        if replace(self, noise=None).form not in ("plain", "solver"):
+            raise ObservationError(
+                "a chosen noise was given beside held actions, guidance or token times: give one of them"
+            )
+        if self.integration is not None and not self.integration.is_euler:
+            raise ObservationError(
+                f"a chosen noise and solver {self.integration.solver!r} were both given: noise is found by Euler's "
+                "steps, so take solver 'euler'"
+            )
+        _check_mask("a chosen noise's rows", noise.rows, horizon)
+        _check("a chosen noise's values", noise.values, chunk, noise.rows)
 
     def _check_integration(self, integration: Integration, num_steps: int) -> None:
         if self.tokens is not None:
@@ -286,6 +317,11 @@ def row_named(row: int, rows: int) -> Iterator[None]:
         if rows == 1:
             raise
         raise ObservationError(f"observation {row} of {rows} (from 0): {error}") from None
+
+
+def _check_mask(what: str, mask: np.ndarray, horizon: int) -> None:
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (horizon,):
+        raise ObservationError(f"{what} is {_described(mask)}; it should be bool of shape {[horizon]}")
 
 
 def _check(what: str, array: np.ndarray, shape: tuple[int, ...], rows: np.ndarray | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The loop from noise to actions, of every family: times, held actions, guidance and solvers."""
+"""The loop from noise to actions, of every family: times, held actions, guidance, solvers, chosen noise."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -102,6 +102,16 @@ def integrate(
         if second is None:
             raise ObservationError("guidance by a second prompt was asked for, but nothing was computed of that prompt")
         velocity = mixed_velocity(velocity, second, wanted.prompt)
+    if wanted.noise is not None:
+        ahead, back = wanted.passes(num_steps, horizon, grid)
+
+        def unnoted(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
+            return velocity(x, time, False)  # a trace is of the last loop
+
+        def loop(x: Tensor, backwards: bool) -> Tensor:
+            return integrate(unnoted, embed_times, x, num_steps, back if backwards else ahead, grid=grid).actions
+
+        noise = wanted.noise.chosen(noise, loop)
     tokens, guidance = wanted.token_times(num_steps, horizon, grid), wanted.guidance
     distinct = tokens.distinct()
     rows = tokens.rows(distinct)

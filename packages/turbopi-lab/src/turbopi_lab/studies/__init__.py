@@ -27,6 +27,7 @@ STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are
     "distillation": "one denoising step by distillation",
     "kv_reuse": "keys and values of old images, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
+    "noise_choice": "noise chosen so that a chunk continues the running one",
     "pipelining": "the next observation encoded beside this one's denoising",
     "steps_libero": "steps on LIBERO (any checkpoint for it; else the small policy)",
     "kv_reuse_libero": "kv_reuse on LIBERO",

@@ -42,6 +42,7 @@ from turbopi_lab.studies.rollouts import (
     ToyPolicy,
     open_policy,
     play,
+    rest,
     sampled,
     seeds_of,
 )
@@ -109,7 +110,8 @@ def play_late(policy: ToyPolicy, episodes: Sequence[int], actor: Actor, timing: 
     chunk, seen_at = torch.empty(0), 0
     for step in range(policy.toy.max_steps):
         if step % timing.period == 0:
-            call = Call(step // timing.period, episodes, policy.observe(world), policy.noise(episodes, step), None)
+            left = rest(chunk, step - seen_at) if step else None
+            call = Call(step // timing.period, episodes, policy.observe(world), policy.noise(episodes, step), left)
             coming[0 if step == 0 else step + timing.latency] = step, actor(call)
         if step in coming:
             seen_at, chunk = coming.pop(step)

@@ -158,7 +158,7 @@ def play(
             if not len(rows):
                 break
             call, numbers = step // replan, [episodes[row] for row in rows]
-            previous = None if step == 0 else _rest(chunk[rows], replan)
+            previous = None if step == 0 else rest(chunk[rows], replan)
             seen, noise = policy.observe(world.rows(rows)), policy.noise(numbers, call)
             chunk[rows] = actor(Call(call, numbers, seen, noise, previous))
         solved |= world.step(chunk[:, step % replan, :2].double().numpy())
@@ -167,6 +167,6 @@ def play(
     return Played(solved, touched, np.stack(paths))
 
 
-def _rest(chunk: Tensor, done: int) -> Tensor:
+def rest(chunk: Tensor, done: int) -> Tensor:
     """A chunk from its action `done` on, its last action repeated."""
     return torch.cat((chunk[:, done:], chunk[:, -1:].expand(-1, done, -1)), dim=1)
