@@ -7,6 +7,7 @@ import sys
 import tempfile
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of threads that tests start, too: sums are added in one order
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from compile_for_all.document import Compiled, CompiledForAll, written
+from compile_for_all.document import Compiled, CompiledForAll, write_compiled
 from doc_tables import gpus as tables
 from tile_helpers import verdict
 
@@ -94,7 +94,7 @@ def test_compiled_kernels_are_counted_by_target(tmp_path: Path) -> None:
         Compiled("c", "1", "sm_89", refused="Hopper's own"),
         Compiled("a", "1", "sm_120a"),
     ]
-    (tmp_path / tables.COMPILED).write_text(written(CompiledForAll("2026-11-27", {}, rows)))
+    write_compiled(tmp_path / tables.COMPILED, CompiledForAll("2026-11-27", {}, rows))
     found = tables.gpus(tmp_path)
     assert cells(found, "GeForce RTX 4090")["kernels compiled"] == "1 of 2"
     assert cells(found, "GeForce RTX 5090")["kernels compiled"] == "1"

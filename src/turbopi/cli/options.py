@@ -217,9 +217,9 @@ class PolicyOptions(RobotOptions):
         _option(
             "--precision",
             panel=_RUNNING,
-            metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8",
-            help="bf16 as openpi serves it, f32, int8-weights for Pi0-FAST, the rest calibrated. Unless given, what "
-            "the folder keeps its weights in, else bf16, or what --backend has instead.",
+            metavar="NAME",
+            help="bf16 as openpi serves it, f32, int8-weights (Pi0-FAST), or calibrated: fp8, fp8-mlp, int8. Unless "
+            "given, the folder's own, else bf16, or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[
