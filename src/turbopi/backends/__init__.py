@@ -212,7 +212,7 @@ def choose(
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []
     for name in _FASTEST_FIRST:
-        if precision not in precisions(name):
+        if precision not in all_precisions(name):
             continue
         reason, qualified = availability(name, device), ""
         if reason is None and model is not None:
@@ -295,7 +295,7 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     checked_precision(precision)
     cls = class_of(name)
-    if precision not in (own := precisions(name)):
+    if precision not in (own := all_precisions(name)):
         raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}")
     reason, what = _unavailable(cls, device), "run"
     if precision in TIERS:
@@ -338,8 +338,13 @@ def create(
 
 
 def precisions(name: str) -> tuple[Precision, ...]:
-    """The precisions a backend runs in, whatever the model."""
-    own, spec = class_of(name).precisions, BACKENDS.get(name)
+    """The precisions a backend runs Pi0 and Pi0.5 in."""
+    return class_of(name).precisions
+
+
+def all_precisions(name: str) -> tuple[Precision, ...]:
+    """The same, with those of models that write their actions as tokens."""
+    own, spec = precisions(name), BACKENDS.get(name)
     if spec is None or spec.tokens is None:
         return own
     return tuple(dict.fromkeys((*own, *_loaded(spec.tokens).precisions)))

@@ -91,10 +91,10 @@ class BenchPlan:
             raise ConfigError("chunks join by openpi's steps: --join without --solver and --time-grid")
         named = [*self.backends, *self.beside]
         for precision in self.precisions:
-            if precision in PRECISIONS and not any(precision in backends.precisions(name) for name in named):
+            if precision in PRECISIONS and not any(precision in backends.all_precisions(name) for name in named):
                 raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
         for precision, name in itertools.product(self.precisions, named):
-            if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.precisions(name):
+            if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.all_precisions(name):
                 backends.check(name, device, precision)
 
     def jobs(self) -> Iterator[Job]:
@@ -107,7 +107,7 @@ class BenchPlan:
     def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
         """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
         for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
-            if len(self.precisions) == 1 or precision in backends.precisions(name):
+            if len(self.precisions) == 1 or precision in backends.all_precisions(name):
                 yield precision, name, list(self.jobs()) if name in self.backends else [self.main]
 
     def calls_of(self, backend: str, job: Job) -> int:
