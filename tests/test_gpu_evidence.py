@@ -169,10 +169,43 @@ def script() -> ModuleType:
 def test_a_second_run_repeats_what_failed_and_files_that_count_anew_and_counts_each_test_once() -> None:
     gpu_check = script()
     parts = [["tests/a.py::one", "tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"], ["tests/c.py::five"]]
-    left, repeated = gpu_check.left_of(parts, ["two[x]", "four", "gone"], ["tests/b.py"])
-    assert left == [["tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"]] and repeated == 1
     before = gpu_evidence.GpuTests(6, 3, 0, 1, 10.0, ["two[x]", "four", "gone"], 0)
+    left, repeated = gpu_check.left_of(parts, before, ["tests/b.py"])
+    assert left == [["tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"]] and repeated == 1
     now = gpu_evidence.GpuTests(3, 1, 0, 0, 2.0, ["four"], 0)
     assert gpu_check.added(before, now, repeated) == gpu_evidence.GpuTests(5, 1, 0, 1, 12.0, ["four"], 0)
     nothing_left = gpu_check.added(before, None, 0)
     assert (nothing_left.tests, nothing_left.failures, nothing_left.failed) == (3, 0, [])
+
+
+PARTS = [["a.py::one", "a.py::two"], ["b.py::one", "b.py::three"], ["b.py::four"]]
+
+
+def counted(*, tests: int, failed: list[str] | None = None, to_go: list[str] | None = None) -> gpu_evidence.GpuTests:
+    bad, left = failed or [], to_go or []
+    return gpu_evidence.GpuTests(tests, len(bad), 0, 1, 9.0, bad, len(left), left)
+
+
+def test_a_run_that_was_cut_off_goes_on_with_what_is_left() -> None:
+    gpu_check = script()
+    before = counted(tests=2, to_go=["b.py::one", "b.py::four"])
+    assert gpu_check.is_continued(PARTS, before)
+    left, repeated = gpu_check.left_of(PARTS, before, [])
+    assert (left, repeated) == (PARTS[1:], 0)
+    cut_again = gpu_check.added(before, counted(tests=2, to_go=["b.py::four"]), repeated)
+    assert cut_again.to_go == ["b.py::four"] and cut_again.parts_to_go == 1 and cut_again.tests == 4
+    whole = gpu_check.added(cut_again, counted(tests=1), 0)
+    assert (whole.tests, whole.skipped, whole.parts_to_go, whole.to_go) == (5, 3, 0, [])
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        counted(tests=2, failed=["two"], to_go=["b.py::four"]),
+        counted(tests=2, to_go=["b.py::three"]),
+        gpu_evidence.GpuTests(2, 0, 0, 0, 9.0, [], 2),
+    ],
+    ids=["tests failed", "a part that isn't one", "only how many"],
+)
+def test_a_run_that_does_not_say_what_is_left_is_not_gone_on_with(before: gpu_evidence.GpuTests) -> None:
+    assert not script().is_continued(PARTS, before)

@@ -52,7 +52,7 @@ MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 
 
 class GpuTests(Struct, frozen=True):
-    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet."""
+    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet, `to_go` by the first test of each."""
 
     tests: int
     failures: int
@@ -61,6 +61,7 @@ class GpuTests(Struct, frozen=True):
     seconds: float
     failed: list[str]
     parts_to_go: int
+    to_go: list[str] = []
 
 
 class GoldenCheck(Struct, frozen=True):
