@@ -276,9 +276,8 @@ def test_the_process_itself_says_all_of_it(child: Child, monkeypatch: pytest.Mon
     said: list[tuple[str, int]] = []
     verdict = qualify(GPU, "bf16", TWO_LAYERS.model, seconds=900, tell=lambda *one: said.append(one))
     assert not verdict.failed and not verdict.excluded and verdict.log == "", verdict
-    assert [one.name for one in verdict.stages] == list(STAGES[:4]) and verdict.stages[0].figures == {
-        "barrier us": 1.25
-    }
+    assert [one.name for one in verdict.stages] == [*STAGES[:3], STAGES[4]]  # no shipped policy is of these sizes
+    assert verdict.stages[0].figures == {"barrier us": 1.25}
     assert set(verdict.milliseconds) == {"fused", "cuda_graph"} and verdict.taken in verdict.milliseconds
     assert verdict.reason.startswith("right; fused ") and {at for at, _ in said} >= {"float32 reference", "kernels"}
     assert qualification.kept(GPU, "bf16", TWO_LAYERS.model) == verdict

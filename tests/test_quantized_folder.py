@@ -20,7 +20,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.fused import FusedBackend
 from turbopi.checkpoint import Checkpoint, open_checkpoint, write_random
 from turbopi.checkpoint.calibration import for_policy
-from turbopi.checkpoint.quantized_folder import MANIFEST, TENSORS, QuantizedOnly
+from turbopi.checkpoint.quantized_folder import MANIFEST, TENSORS, QuantizedOnly, sealed
 from turbopi.config import PolicyConfig
 from turbopi.engine.call import Cache, Images, StaticCall
 from turbopi.engine.quantized_writer import write_quantized
@@ -148,7 +148,7 @@ def test_what_such_a_folder_cannot_do_is_refused_by_name(tiny: Path, tmp_path: P
 
 
 def test_the_policy_takes_the_folders_precision_unless_another_is_given(tiny: Path) -> None:
-    with pytest.raises(BackendUnavailable, match="backend 'fused' can't run on cpu"):
+    with pytest.raises(BackendUnavailable, match="keeps its weights in int8, and backend 'fused' can't run on cpu"):
         UnifiedPolicy(tiny / "int8", device="cpu")
     with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
         UnifiedPolicy(tiny / "int8", device="cpu", precision="f32")
@@ -178,9 +178,12 @@ def test_what_is_not_as_it_was_written_is_refused(tiny: Path, tmp_path: Path) ->
         ({"sizes": {**manifest["sizes"], "vlm": 3}}, "sizes aren't those of a model"),
     ):
         folder = Path(shutil.copytree(tiny / "fp8", tmp_path / "copy", dirs_exist_ok=True))
-        (folder / MANIFEST).write_text(json.dumps(manifest | change))
+        (folder / MANIFEST).write_text(json.dumps(sealed(manifest | change)))
         with pytest.raises((CheckpointError, CalibrationError), match=says):
             open_checkpoint(folder)
+    (folder / MANIFEST).write_text(json.dumps(manifest | {"sizes": {**manifest["sizes"], "rope_base": 100.0}}))
+    with pytest.raises(CheckpointError, match=r"was changed since it was written\. Copy the whole"):
+        open_checkpoint(folder)
 
 
 @pytest.mark.parametrize(
@@ -207,12 +210,22 @@ def test_damaged_numbers_are_refused_when_they_are_loaded(tiny: Path, tmp_path: 
         backend_of(tmp_path / "fp8", "fp8")
 
 
+def test_numbers_that_look_right_are_found_by_their_hash(tiny: Path, tmp_path: Path) -> None:
+    assert turbopi("inspect", tiny / "fp8", "--hash").exit_code == 0
+    folder = Path(shutil.copytree(tiny / "fp8", tmp_path / "copy"))
+    content = bytearray((folder / TENSORS).read_bytes())
+    content[-1] ^= 1
+    (folder / TENSORS).write_bytes(content)
+    result = turbopi("inspect", folder, "--hash")
+    assert result.exit_code != 0 and "quantized.safetensors is damaged" in result.stderr
+
+
 def changed(folder: Path, to: Path, tensors: dict[str, Tensor | None]) -> Path:
     """A copy with other tensors, whose manifest agrees."""
     copy = Path(shutil.copytree(folder, to / folder.name))
     all_of_them: dict[str, Tensor | None] = {**load_file(copy / TENSORS), **tensors}
     save_file({name: one for name, one in all_of_them.items() if one is not None}, copy / TENSORS)
-    manifest = json.loads((copy / MANIFEST).read_text()) | {"bytes": (copy / TENSORS).stat().st_size}
+    manifest = sealed(json.loads((copy / MANIFEST).read_text()) | {"bytes": (copy / TENSORS).stat().st_size})
     (copy / MANIFEST).write_text(json.dumps(manifest))
     return copy
 

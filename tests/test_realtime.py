@@ -129,6 +129,21 @@ def test_a_slow_first_call_is_not_expected_again() -> None:
     )  # both ways are warm
 
 
+@pytest.mark.parametrize("execution", ["paint", "rtc_trained"])
+def test_a_mode_that_costs_nothing_without_a_delay_is_timed_with_one(execution: str) -> None:
+    loop, policy = started(execution, warm=False, execution_horizon=4)
+
+    def slow(result: dict[str, Any]) -> dict[str, Any]:
+        previous = policy.calls[-1]["previous"]
+        policy.clock.now += (3 if previous is not None and previous.delay else 1) / HZ
+        return result
+
+    policy.change = slow
+    loop.hand.at_once = True
+    loop.executor.warm_up({"place": 0})
+    assert loop.executor.report()["expected_delay"] == 3
+
+
 def test_without_a_warm_up_the_first_observation_warms_up_in_the_background() -> None:
     loop, policy = started("async", warm=False)
     loop.step()

@@ -206,6 +206,11 @@ class Checkpoint:
                 f"is {self.fingerprint()}: they are damaged, or others. Copy them anew, or correct weights_sha256"
             )
 
+    def check_files(self) -> None:
+        """Raise CheckpointError if a folder with weights in eight bits isn't what was written: reads it all."""
+        if isinstance(self.source, QuantizedSource):
+            self.source.check_file()
+
     def fingerprint(self, *, trust_files: bool = False) -> str:
         """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian), and of
         a pi052's language head where it isn't the embedding.

@@ -45,6 +45,7 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
     if tier not in TIERS:
         check_given(tier, given)
         return None
+    model = checkpoint.config.planned_model
     if given is None:
         numbers = format_of(tier).name
         beside = None if checkpoint.path is None else checkpoint.path / BESIDE[numbers]
@@ -59,10 +60,10 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
     if kept is not None:
         kept.check(tier, quantization)
     if checkpoint.path is None:  # weights would have to be made to be hashed
-        quantization.check_shapes(checkpoint.config.planned_model)
+        quantization.check_shapes(model)
     else:
-        quantization.check(checkpoint.config.planned_model, checkpoint.fingerprint(trust_files=True))
-    plan = quantization.plan(checkpoint.config.planned_model, tier)
+        quantization.check(model, checkpoint.fingerprint(trust_files=True))
+    plan = quantization.plan(model, tier)
     if not plan.scales:
         reasons = "; ".join(f"{count} sites: {why}" for why, count in Counter(plan.kept.values()).items())
         raise ConfigError(

@@ -3,7 +3,8 @@
     quantized.safetensors       a parameter under its canonical name, in bfloat16 or float32 as the engine has it; or a
                                 matrix of the engine by its place: prefix.0.qkv.codes e4m3 or int8[out, in],
                                 prefix.0.qkv.scale float32[out], of its channels alone
-    turbopi_quantized.json      precision, sizes, versions, lengths of the files, hashes of weights and calibration
+    turbopi_quantized.json      precision, sizes, versions, the file's length, hashes of it, of weights, calibration and
+                                all that this document says
     turbopi_fp8.json, or _int8  the calibration
     turbopi.json, assets/, ...  what a checkpoint has beside its weights
 
@@ -11,7 +12,9 @@ No kernel's order is in it, so all that `fused` has for a precision read the sam
 too, for the calls that operations denoise.
 """
 
-from collections.abc import Iterator
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -90,6 +93,7 @@ class QuantizedSource:
         self.precision: Tier = manifest["precision"]
         self.bytes: int = manifest["bytes"]  # of the file
         self.weights_sha256: str = manifest["weights_sha256"]
+        self._file_sha256: str = manifest["file_sha256"]
         self._identity: str = manifest["calibration"]
         calibration = Quantization.load(folder / manifest["calibration_file"])
         if calibration.identity != self._identity:
@@ -107,6 +111,11 @@ class QuantizedSource:
         self.notes = [f"weights in {self.precision}, rounded on {one_line(str(manifest['rounded_on']))}"]
         if self.random is not None:
             self.notes.append(random_note(one_line(self.random)))
+
+    def check_file(self) -> None:
+        """Read the whole file. Raises CheckpointError if it isn't what was written."""
+        if file_sha256(self.file) != self._file_sha256:
+            raise CheckpointError(f"{self.file} is damaged: its SHA-256 isn't what {MANIFEST} says. {_ANEW}")
 
     @property
     def plain(self) -> set[str]:
@@ -184,10 +193,27 @@ def _read_manifest(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     fields.choice("calibration_file", tuple(f"turbopi_{name}.json" for name in FORMATS))
     if manifest["calibration_file"] != f"turbopi_{format.name}.json":
         fields.refuse("calibration_file", f"turbopi_{format.name}.json")
-    for name in ("weights_sha256", "calibration", "rounded_on"):
+    for name in ("weights_sha256", "file_sha256", "calibration", "rounded_on"):
         fields.text(name)
     length = (file.parent / TENSORS).stat().st_size if (file.parent / TENSORS).is_file() else None
     if length != fields.integer("bytes", 0, 2**50):
         found = "is missing" if length is None else f"has {length} bytes instead of {shown(manifest['bytes'])}"
         raise CheckpointError(f"{file.parent / TENSORS} {found}. {_ANEW}")
-    return manifest, model_of_sizes(fields)
+    model = model_of_sizes(fields)
+    if sealed(manifest) != manifest:
+        raise CheckpointError(f"{file} was changed since it was written. {_ANEW}")
+    return manifest, model
+
+
+def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """A manifest with the SHA-256 of all else that it says."""
+    said = {name: value for name, value in manifest.items() if name != "sha256"}
+    return said | {"sha256": hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()}
+
+
+def file_sha256(file: Path) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as content:
+        while block := content.read(1 << 24):
+            digest.update(block)
+    return digest.hexdigest()

@@ -74,6 +74,7 @@ def inspect(
     if hash and refused is None:
         opened = options.open(checkpoint)
         opened.check_hash()
+        opened.check_files()
         info["sha256"] = opened.fingerprint()
     _show(info, output)
     if refused is not None:

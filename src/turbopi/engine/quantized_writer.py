@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.convert import check_new, write_beside
-from turbopi.checkpoint.quantized_folder import FORMAT, MANIFEST, TENSORS, VERSION, tensors_of
+from turbopi.checkpoint.quantized_folder import FORMAT, MANIFEST, TENSORS, VERSION, file_sha256, sealed, tensors_of
 from turbopi.checkpoint.source import RANDOM_KEY
 from turbopi.checkpoint.tensor_file import TensorFile
 from turbopi.engine.graph import preparing
@@ -75,10 +75,12 @@ def write_quantized(
             "rounded_on": torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU",
             "random_weights": checkpoint.random,
             "bytes": (folder / TENSORS).stat().st_size,
+            "file_sha256": file_sha256(folder / TENSORS),
             "sizes": asdict(config),
             "versions": {"turbopi": about.turbopi, "torch": about.torch, "triton": about.triton},
         }
-        (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+        written = sealed(json.loads(json.dumps(manifest)))  # with lists for tuples, as it is read
+        (folder / MANIFEST).write_text(json.dumps(written, indent=1) + "\n")
     return dst
 
 

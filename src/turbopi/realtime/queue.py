@@ -316,9 +316,10 @@ class ChunkQueue:
     def learn(self, result: Any) -> RunningChunk | None:
         """A chunk that nobody carries out, such as a warm-up's, shows H. Raises ConfigError as `arrive` does.
 
-        Returns what the policy would be told once s actions of it were carried out, for another call of the warm-up;
-        None if nothing would be left, or the policy is never told. Raises ConfigError for what is no chunk, ActionError
-        for one with numbers that aren't finite: the next one's may be.
+        Returns what the policy would be told once s actions of it were carried out, for another call of the warm-up,
+        with a delay of one step at least: with none some modes make a plain call. None if nothing would be left, or the
+        policy is never told. Raises ConfigError for what is no chunk, ActionError for one with numbers that aren't
+        finite: the next one's may be.
         """
         try:
             chunk = self._read(-1, result)
@@ -327,7 +328,7 @@ class ChunkQueue:
         except ActionError as error:
             raise ConfigError(str(error)) from error
         self._learn(chunk)
-        return self._reported(chunk, self.execution_horizon, self._delay.steps)
+        return self._reported(chunk, self.execution_horizon, max(1, self._delay.steps))
 
     def fail(self, reason: Reason = "failed", text: str = "the policy gave no chunk") -> None:
         """The chunk in flight will never be there."""
