@@ -51,7 +51,7 @@ HOST_ONLY = (
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 
 
-class GpuTests(Struct, frozen=True):
+class GpuTests(Struct, frozen=True, omit_defaults=True):
     """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet, `to_go` by the first test of each."""
 
     tests: int
