@@ -136,7 +136,7 @@ def test_a_drivers_calls_of_a_part_end_with_its_time_but_three() -> None:
     assert len(rounds._times(part, 20, None)["ms"]) == 20
 
 
-def test_figures_are_told_after_each_round(fake: entries.Program) -> None:
+def test_figures_are_given_after_each_round(fake: entries.Program) -> None:
     settings = [(replace(fake, name=name), "bf16", sys.executable, {"fault": fault}) for name, fault in FAULTS]
     seen: list[tuple[list[int], list[str]]] = []
     running.time_job(

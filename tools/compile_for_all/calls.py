@@ -276,10 +276,11 @@ def _smolvla(target: Target) -> Calls:
 
 
 def _one_token() -> None:
+    """Of Pi0-FAST: a layer behind three images and a prompt, in bf16 and with INT8 weights, and the head."""
+
     def int8(rows: int, columns: int) -> token.Int8Rows:
         return token.Int8Rows(of(rows, columns // 4, dtype=torch.int32), of(rows, dtype=F32))
 
-    """Of Pi0-FAST: a layer behind three images and a prompt, and the head."""
     norm, row, (heads, dim, width, hidden, places) = (
         nn.RMSNorm(2048, dtype=BF16),
         of(2048, dtype=F32),

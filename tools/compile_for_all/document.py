@@ -1,13 +1,13 @@
 """What `python -m compile_for_all --json` writes, and reads again."""
 
 import json
-import lzma
 from pathlib import Path
 
 from msgspec import Struct, structs
+from packed import read_packed, write_content
 
 from turbopi.support.errors import ConfigError
-from turbopi.support.reading import as_document, plain_document, read_document
+from turbopi.support.reading import plain_document
 
 
 class Compiled(Struct, frozen=True):
@@ -51,10 +51,7 @@ class _File(Struct, frozen=True):
 
 def read_compiled(file: Path) -> CompiledForAll:
     """Raises ConfigError, a ValueError, for another file. One that ends in .xz is packed."""
-    if file.suffix == ".xz":
-        document = as_document(json.loads(lzma.decompress(file.read_bytes())), _File, str(file))
-    else:
-        document = read_document(file, _File, ConfigError)
+    document = read_packed(file, _File)
     rows = []
     for one in document.kernels:
         for used, targets in one.found.items():
@@ -99,5 +96,4 @@ def written(document: CompiledForAll) -> str:
 
 def write_compiled(file: Path, result: CompiledForAll) -> None:
     """As `read_compiled` reads it."""
-    content = written(result).encode()
-    file.write_bytes(lzma.compress(content, preset=9 | lzma.PRESET_EXTREME) if file.suffix == ".xz" else content)
+    write_content(file, written(result).encode())

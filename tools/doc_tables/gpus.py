@@ -6,7 +6,6 @@ at a device of that compute capability that isn't there.
 """
 
 import json
-import lzma
 import re
 import shutil
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from unittest.mock import patch
 import torch
 from compile_for_all.document import read_compiled
 from msgspec import structs
+from packed import content_of
 
 from turbopi import backends
 from turbopi.backends import Precision, qualification
@@ -93,8 +93,7 @@ def rows_of(file: Path) -> list[dict[str, object]]:
     """The `rows` of a result file, each of a kernel for a `target`; none where the file isn't there yet."""
     if not file.is_file():
         return []
-    packed = file.read_bytes()
-    document = json.loads(lzma.decompress(packed) if file.suffix == ".xz" else packed)
+    document = json.loads(content_of(file))
     rows = document.get("rows", []) if isinstance(document, dict) else []
     return [row for row in rows if isinstance(row, dict) and "target" in row]
 

@@ -1,22 +1,18 @@
 """Reports of studies below benchmarks/results/: their Markdown and plots, and the documents' tables of them."""
 
-import json
-import lzma
 from collections.abc import Iterator
 from pathlib import Path
 
+from packed import read_packed, write_content
+
 from doc_tables.drawn import compacted
-from turbopi.support.errors import ConfigError
-from turbopi.support.reading import as_document, read_document
 from turbopi_lab.studies import report
 from turbopi_lab.studies.report import Report, table_lines
 
 
 def read_report(file: Path) -> Report:
     """Raises ConfigError, a ValueError, for a file of another kind. A large one may be packed (.xz)."""
-    if file.suffix == ".xz":
-        return as_document(json.loads(lzma.decompress(file.read_bytes())), Report, str(file))
-    return read_document(file, Report, ConfigError)
+    return read_packed(file, Report)
 
 
 def _reports(root: Path) -> Iterator[tuple[Path, Report]]:
@@ -27,7 +23,7 @@ def _reports(root: Path) -> Iterator[tuple[Path, Report]]:
 def _written(file: Path, document: Report) -> Iterator[Path]:
     for path in report.write(document, file.parent):
         if path.name == report.JSON and file.suffix == ".xz":
-            file.write_bytes(lzma.compress(path.read_bytes(), preset=9 | lzma.PRESET_EXTREME))
+            write_content(file, path.read_bytes())
             path.unlink()
         else:
             yield path

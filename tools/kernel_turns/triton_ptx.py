@@ -106,8 +106,8 @@ def found_operations(target: Target) -> list[Operation]:
 
     fp8 = found("fp8")
     int8 = [replace(one, numbers="int8") for one in fp8 if one.numbers == "fp8"]  # of attention there is no bench
-    taken = [] if tiles.fp8_refusal(target.capability) is not None else fp8
-    taken += [] if tiles.int8_refusal(target.capability) is not None else int8
+    refusals = ((fp8, tiles.fp8_refusal), (int8, tiles.int8_refusal))
+    taken = [one for found_in, refusal in refusals if refusal(target.capability) is None for one in found_in]
     return list({(one.key, one.out_fp8): one for one in found("bf16") + taken}.values())
 
 

@@ -8,7 +8,7 @@
 Pi0.5 of full size, random weights, the same job for all. Turbo-Pi always runs too. For each horizon all programs stand
 ready, in processes of their own, and are called in turns, so they need room on the GPU together: some 100 GB for all.
 The file is written after each round. What can't be installed, doesn't start or fails in a call is in it with its
-reason, and has no figures. Exit code 1 if a program that was asked for has none.
+reason, and has no figures. Exit code 1 if a program that was requested has none.
 """
 
 import argparse

@@ -295,13 +295,13 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     checked_precision(precision)
     cls = class_of(name)
-    if precision not in (own := all_precisions(name)) and precision == WEIGHTS_ALONE:
+    if precision not in (own := all_precisions(name)):
+        if precision != WEIGHTS_ALONE:
+            raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}")
         raise ConfigError(
             f"backend {name!r} doesn't run in {precision!r}: models that write their actions as tokens (Pi0-FAST) do, "
             "in backend 'cuda_graph' on an NVIDIA GPU"
         )
-    if precision not in own:
-        raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}")
     reason, what = _unavailable(cls, device), "run"
     if precision in TIERS:
         if reason is not None and device.type != "cuda":

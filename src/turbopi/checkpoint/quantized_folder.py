@@ -41,7 +41,7 @@ _ANEW = "Copy the whole folder, or convert the checkpoint anew"
 
 
 class QuantizedOnly(ConfigError):
-    """Something else was asked of weights that are kept in eight bits."""
+    """Weights that are kept in eight bits can't do what was requested."""
 
     def __init__(self, folder: Path, precision: str) -> None:
         super().__init__(

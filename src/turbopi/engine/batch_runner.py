@@ -23,7 +23,7 @@ from turbopi.engine import plan
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix, SharedRows
 from turbopi.engine.call import Images
 from turbopi.engine.graph_cache import Captured
-from turbopi.engine.loops import Loop, batch_form, loop_of_batch
+from turbopi.engine.loops import ALONE, Loop, batch_form, loop_of_batch
 from turbopi.engine.plan import GraphKey, split
 from turbopi.engine.runner import GraphRunner, HostRow, floats
 from turbopi.engine.trace import padded_trace
@@ -116,7 +116,7 @@ class BatchRunner(GraphRunner):
         """See `turbopi.backends.base.Backend`."""
         cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
         form, actions = batch_form(conditioning), self.config.action_horizon if horizon is None else horizon
-        if form in plan.ALONE:
+        if form in ALONE:
             return
         loop = loop_of_batch([conditioning], num_steps, actions, self.config)
         self._check_cameras(cameras)
@@ -279,7 +279,7 @@ class BatchRunner(GraphRunner):
             return [(1, [0])]
         calls: list[Call] = []
         for form, rows in plan.groups(forms):
-            if form in plan.ALONE:
+            if form in ALONE:
                 calls += [(0 if form == "two_prompts" else 1, [row]) for row in rows]
                 continue
             for size in self._split(len(rows), form):

@@ -22,6 +22,7 @@ from turbopi.models.pi0.denoise import time_grid
 from turbopi.models.pi0.solvers import Integration
 from turbopi.support.errors import ObservationError
 
+ALONE: tuple[Form, ...] = ("solver", "noise", "two_prompts")  # an observation with such a loop shares no call
 MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
 Table = int | tuple[float, ...]  # rows for so many of openpi's steps, or for these times
 
@@ -142,7 +143,7 @@ def loop_of_call(
 
 
 def batch_form(conditioning: Conditioning | None) -> Form:
-    """What an observation with this conditioning needs of a batched loop; see `plan.ALONE`."""
+    """What an observation with this conditioning needs of a batched loop; see ALONE."""
     if conditioning is None:
         return "plain"
     form, integration = conditioning.form, conditioning.integration
@@ -157,7 +158,7 @@ def loop_of_batch(
     Its times are those of all observations, and openpi's, so that plain observations fit it.
     """
     forms = {batch_form(one) for one in conditionings}
-    assert not forms & {"solver", "noise", "two_prompts"}, "they run alone"
+    assert forms.isdisjoint(ALONE), "they run alone"
     if forms == {"plain"}:
         return EulerLoop(num_steps, horizon)
     own = _own_times(num_steps, config.time_grid)

@@ -13,13 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
-from turbopi.engine.loops import Loop
+from turbopi.engine.loops import ALONE, Loop
 from turbopi.models.pi0.conditioning import Form
 from turbopi.support.errors import ObservationError
 
 BUCKET = 16  # prompt tokens: at most 15 padded rows beside 256 a camera
 MAX_CAMERAS = 4  # the cache is allocated for them
-ALONE: tuple[Form, ...] = ("solver", "noise", "two_prompts")  # an observation with such a loop shares no call
 Part = Literal["vision", "resized", "answer", "prefix", "denoise"]
 
 

@@ -298,7 +298,7 @@ class GraphRunner:
     def _passes(
         self, conditioning: Conditioning | None, num_steps: int, horizon: int
     ) -> tuple[Conditioning | None, Conditioning | None]:
-        """What the loop is asked for, and where noise is chosen, the loop back. Raises ObservationError."""
+        """The loop's conditioning and, where noise is chosen, that of the loop back. Raises ObservationError."""
         if conditioning is None or conditioning.noise is None:
             return conditioning, None
         conditioning.check(num_steps, horizon, self.config.action_dim)
