@@ -181,6 +181,10 @@ def test_a_second_run_repeats_what_failed_and_files_that_count_anew_and_counts_e
 PARTS = [["a.py::one", "a.py::two"], ["b.py::one", "b.py::three"], ["b.py::four"]]
 
 
+def test_a_run_begins_with_what_took_longest() -> None:
+    assert script().slowest_first(PARTS, {"b.py::four": 90.0, "gone.py::one": 300.0}) == [PARTS[2], PARTS[0], PARTS[1]]
+
+
 def counted(*, tests: int, failed: list[str] | None = None, to_go: list[str] | None = None) -> gpu_evidence.GpuTests:
     bad, left = failed or [], to_go or []
     return gpu_evidence.GpuTests(tests, len(bad), 0, 1, 9.0, bad, len(left), left)

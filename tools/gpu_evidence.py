@@ -52,7 +52,10 @@ MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 
 
 class GpuTests(Struct, frozen=True, omit_defaults=True):
-    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet, `to_go` by the first test of each."""
+    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet, `to_go` by the first test of each.
+
+    `slow_parts`: seconds of those that took a minute or more, by the first test: the next run begins with them.
+    """
 
     tests: int
     failures: int
@@ -62,6 +65,7 @@ class GpuTests(Struct, frozen=True, omit_defaults=True):
     failed: list[str]
     parts_to_go: int
     to_go: list[str] = []
+    slow_parts: dict[str, float] = {}
 
 
 class GoldenCheck(Struct, frozen=True):
