@@ -32,7 +32,7 @@ def code(tmp_path: Path, name: str, text: str) -> str:
 
 def test_a_checked_in_gpu_result_is_of_this_code() -> None:
     results = [gpu_evidence.read_result(file) for file in gpu_evidence.result_files()]
-    whole = [one for one in results if one.ok and one.tests.parts_to_go == 0]
+    whole = [one for one in results if one.ok and not one.tests.to_go]
     waiting = gpu_evidence.pending()
     recorded = [one.fingerprint for one in whole]
     if waiting is not None:  # conftest.py says so at the end of every run
@@ -166,50 +166,32 @@ def script() -> ModuleType:
     return module
 
 
+TESTS = ["a.py::one", "a.py::two[x]", "b.py::three", "b.py::four", "c.py::five"]
+
+
 def test_a_second_run_repeats_what_failed_and_files_that_count_anew_and_counts_each_test_once() -> None:
     gpu_check = script()
-    parts = [["tests/a.py::one", "tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"], ["tests/c.py::five"]]
-    before = gpu_evidence.GpuTests(6, 3, 0, 1, 10.0, ["two[x]", "four", "gone"], 0)
-    left, repeated = gpu_check.left_of(parts, before, ["tests/b.py"])
-    assert left == [["tests/a.py::two[x]"], ["tests/b.py::three", "tests/b.py::four"]] and repeated == 1
-    now = gpu_evidence.GpuTests(3, 1, 0, 0, 2.0, ["four"], 0)
-    assert gpu_check.added(before, now, repeated) == gpu_evidence.GpuTests(5, 1, 0, 1, 12.0, ["four"], 0)
+    before = gpu_evidence.GpuTests(6, 3, 0, 1, 10.0, ["two[x]", "four", "gone"])
+    left, repeated = gpu_check.left_of(TESTS, before, ["b.py"])
+    assert left == ["a.py::two[x]", "b.py::three", "b.py::four"] and repeated == 1
+    now = gpu_evidence.GpuTests(3, 1, 0, 0, 2.0, ["four"])
+    assert gpu_check.added(before, now, repeated) == gpu_evidence.GpuTests(5, 1, 0, 1, 12.0, ["four"])
     nothing_left = gpu_check.added(before, None, 0)
     assert (nothing_left.tests, nothing_left.failures, nothing_left.failed) == (3, 0, [])
 
 
-PARTS = [["a.py::one", "a.py::two"], ["b.py::one", "b.py::three"], ["b.py::four"]]
-
-
-def test_a_run_begins_with_what_took_longest() -> None:
-    assert script().slowest_first(PARTS, {"b.py::four": 90.0, "gone.py::one": 300.0}) == [PARTS[2], PARTS[0], PARTS[1]]
-
-
-def counted(*, tests: int, failed: list[str] | None = None, to_go: list[str] | None = None) -> gpu_evidence.GpuTests:
-    bad, left = failed or [], to_go or []
-    return gpu_evidence.GpuTests(tests, len(bad), 0, 1, 9.0, bad, len(left), left)
-
-
-def test_a_run_that_was_cut_off_goes_on_with_what_is_left() -> None:
+def test_a_run_that_was_cut_off_goes_on_with_what_is_left_and_what_failed() -> None:
     gpu_check = script()
-    before = counted(tests=2, to_go=["b.py::one", "b.py::four"])
-    assert gpu_check.is_continued(PARTS, before)
-    left, repeated = gpu_check.left_of(PARTS, before, [])
-    assert (left, repeated) == (PARTS[1:], 0)
-    cut_again = gpu_check.added(before, counted(tests=2, to_go=["b.py::four"]), repeated)
-    assert cut_again.to_go == ["b.py::four"] and cut_again.parts_to_go == 1 and cut_again.tests == 4
-    whole = gpu_check.added(cut_again, counted(tests=1), 0)
-    assert (whole.tests, whole.skipped, whole.parts_to_go, whole.to_go) == (5, 3, 0, [])
+    before = gpu_evidence.GpuTests(2, 1, 0, 1, 9.0, ["one"], TESTS[2:], {"a.py": 8.0})
+    left, repeated = gpu_check.left_of(TESTS, before, [])
+    assert (left, repeated) == ([TESTS[0], *TESTS[2:]], 0)
+    cut_again = gpu_check.added(before, gpu_evidence.GpuTests(2, 0, 0, 0, 3.0, [], TESTS[4:], {"a.py": 1.0}), repeated)
+    assert (cut_again.tests, cut_again.failures, cut_again.to_go) == (3, 0, TESTS[4:])
+    whole = gpu_check.added(cut_again, gpu_evidence.GpuTests(2, 0, 0, 0, 1.0, [], file_seconds={"c.py": 1.0}), 0)
+    assert (whole.tests, whole.to_go, whole.file_seconds) == (5, [], {"a.py": 8.0, "c.py": 1.0})
 
 
-@pytest.mark.parametrize(
-    "before",
-    [
-        counted(tests=2, failed=["two"], to_go=["b.py::four"]),
-        counted(tests=2, to_go=["b.py::three"]),
-        gpu_evidence.GpuTests(2, 0, 0, 0, 9.0, [], 2),
-    ],
-    ids=["tests failed", "a part that isn't one", "only how many"],
-)
-def test_a_run_that_does_not_say_what_is_left_is_not_gone_on_with(before: gpu_evidence.GpuTests) -> None:
-    assert not script().is_continued(PARTS, before)
+def test_a_run_begins_with_what_takes_longest_in_parts_of_a_minute_or_two() -> None:
+    slow, quick = [f"slow.py::{number}" for number in range(6)], [f"quick.py::{number}" for number in range(70)]
+    parts = script().in_parts([*quick, "new.py::test", *slow], {"slow.py": 240.0, "quick.py": 35.0, "gone.py": 300.0})
+    assert parts == [["new.py::test"], slow[:2], slow[2:4], slow[4:], quick[:50], quick[50:]]

@@ -52,10 +52,7 @@ MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 
 
 class GpuTests(Struct, frozen=True, omit_defaults=True):
-    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet, `to_go` by the first test of each.
-
-    `slow_parts`: seconds of those that took a minute or more, by the first test: the next run begins with them.
-    """
+    """Of the tests marked gpu; `failed` by name, `to_go`: not run yet, `file_seconds`: how long each file's took."""
 
     tests: int
     failures: int
@@ -63,9 +60,8 @@ class GpuTests(Struct, frozen=True, omit_defaults=True):
     skipped: int
     seconds: float
     failed: list[str]
-    parts_to_go: int
     to_go: list[str] = []
-    slow_parts: dict[str, float] = {}
+    file_seconds: dict[str, float] = {}
 
 
 class GoldenCheck(Struct, frozen=True):
