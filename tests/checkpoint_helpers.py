@@ -93,9 +93,16 @@ def write_tree(
     value: bool = False,
     root: str = "params.",
     chunks: Mapping[str, list[int]] | None = None,
+    ocdbt: bool = True,
 ) -> Path:
     """Write an Orbax tree as Orbax does from one device: OCDBT, zarr, zstd; every array one chunk, `chunks` aside."""
-    base = {"driver": "ocdbt", "base": params.resolve().as_uri() + "/", "config": {"max_inline_value_bytes": 64}}
+    base: dict[str, Any] = {
+        "driver": "ocdbt",
+        "base": f"{params.resolve().as_uri()}/",
+        "config": {"max_inline_value_bytes": 64},
+    }
+    if not ocdbt:  # a folder for each array
+        base, root = {"driver": "file"}, f"{params.resolve()}/{root}"
     for path, array in tree.items():
         key = root + path.replace("/", ".") + (".value" if value else "")
         metadata = {

@@ -36,6 +36,7 @@ def notes_on_config_json(folder: Path, source: WeightSource, policy: PolicyConfi
         facts |= {
             "action_dim": policy.model.action_dim,
             "action_horizon": policy.model.action_horizon,
+            "chunk_size": policy.model.action_horizon,  # Dexbotic's
             "max_token_len": policy.model.max_prompt_tokens,
             "discrete_state_input": policy.discrete_state_input,
             "pi05": family_of(policy.model).modulated,

@@ -145,6 +145,7 @@ def _unpickle(file: Path) -> str:
         how = ""
     return (
         "pickled weights can run code when loaded and aren't read. In the environment that wrote them: "
-        f'{how}safetensors.torch.save_file(torch.load("{file}", weights_only=True), "{WEIGHTS}"), of the state dict '
-        "alone if there is more in the file"
+        f'{how}w = torch.load("{file}", weights_only=True); '
+        f'safetensors.torch.save_file({{k: w[k].clone() for k in w}}, "{WEIGHTS}"), of the state dict alone if there '
+        "is more in the file"
     )

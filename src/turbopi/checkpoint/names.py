@@ -10,6 +10,7 @@ from typing import Protocol
 _PALIGEMMA = "paligemma_with_expert.paligemma."
 _VISION = _PALIGEMMA + "model.vision_tower.vision_model."
 _LANGUAGE = _PALIGEMMA + "model.language_model."
+_EXPERT = "paligemma_with_expert.gemma_expert.model."
 
 EMBEDDING, HEAD = "vlm.embed_tokens.weight", "lm_head.weight"
 TIED_HEAD = _PALIGEMMA + "lm_head.weight"  # openpi stores the tied embedding once, under the head's name
@@ -25,7 +26,7 @@ _PREFIXES = (  # canonical, openpi; the first that fits
     ("vision.post_layernorm.", _VISION + "post_layernorm."),
     ("projector.", _PALIGEMMA + "model.multi_modal_projector.linear."),
     ("vlm.", _LANGUAGE),
-    ("expert.", "paligemma_with_expert.gemma_expert.model."),
+    ("expert.", _EXPERT),
 )
 
 
@@ -97,8 +98,12 @@ class PiNames:
     trains_head: bool = False
     head: str | None = None
 
+    def current(self, key: str) -> str:
+        """The name that openpi has for it; one that isn't a part of its model comes back unchanged."""
+        return current_name(key)
+
     def canonical(self, key: str) -> str | None:
-        key = current_name(key)
+        key = self.current(key)
         return None if key == UNUSED_HEAD or key.startswith(_OF_TRAINING) else from_openpi(key)
 
     def native(self, name: str) -> str:
@@ -121,3 +126,56 @@ class FastNames(PiNames):
 
     def __init__(self, *, apart: bool = False) -> None:
         self.apart = apart
+
+
+class RenamedNames(PiNames):
+    """Another program's, of the same tensors.
+
+    renamed  (a beginning of its names, openpi's); the first that fits
+    unused   beginnings, in openpi's names, of what it stores and computes no action from
+    """
+
+    program: str
+    renamed: tuple[tuple[str, str], ...]
+    unused: tuple[str, ...] = ()
+
+    def current(self, key: str) -> str:
+        for theirs, openpis in self.renamed:
+            if key.startswith(theirs):
+                return openpis + key.removeprefix(theirs)
+        return key
+
+    def canonical(self, key: str) -> str | None:
+        return None if self.current(key).startswith(self.unused) else super().canonical(key)
+
+    def native(self, name: str) -> str:
+        name = super().native(name)
+        for theirs, openpis in self.renamed:
+            if name.startswith(openpis):
+                return theirs + name.removeprefix(openpis)
+        return name
+
+
+class DexboticNames(RenamedNames):
+    """Behind `model.`; source: Dexmal/dexbotic 0.2, dexbotic.model.{pi0,pi05}."""
+
+    program = "Dexbotic"
+    renamed = (
+        ("llm.embed_tokens.", TIED_HEAD.removesuffix("weight")),
+        ("llm.", _LANGUAGE),
+        ("action_expert.", _EXPERT),
+        ("mm_vision_tower.vision_tower.vision_model.", _VISION),
+        ("mm_projector.", _PALIGEMMA + "model.multi_modal_projector.linear."),
+    )
+    unused = (HEAD, _VISION + "head.", _EXPERT + "embed_tokens.")
+
+
+class StarVLANames(RenamedNames):
+    """Of its frameworks PI0 and PI05; source: starVLA/starVLA 0ed0aad2, starVLA.model.framework.VLM4A."""
+
+    program = "StarVLA"
+    renamed = (
+        ("vlm.model.", _PALIGEMMA),
+        ("action_head.gemma_expert.", "paligemma_with_expert.gemma_expert."),
+        ("action_head.", ""),
+    )

@@ -1,4 +1,4 @@
-"""Normalisation statistics: openpi's `norm_stats.json`, and LeRobot's tensors."""
+"""Normalisation statistics: openpi's `norm_stats.json`, Dexbotic's and StarVLA's files, and LeRobot's tensors."""
 
 import filecmp
 import json
@@ -15,6 +15,7 @@ from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import files_below, is_finite, read_json, shown
 
 FILE_NAME = "norm_stats.json"
+STARVLAS = "dataset_statistics.json"
 STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
 MAX_MAGNITUDE = 1e9  # of a statistic: metres, radians and encoder ticks are far below it, damaged floats mostly above
 
@@ -131,15 +132,25 @@ def feature_stats(values: Mapping[str, object], where: str) -> FeatureStats:
 
 
 def load_norm_stats(file: str | Path) -> NormStats:
-    """Read openpi's `norm_stats.json`. Quantiles may be null (Pi0's files). CheckpointError if it isn't one.
+    """Read openpi's `norm_stats.json`, Dexbotic's or StarVLA's file. CheckpointError if it isn't one.
+
+    Quantiles may be null (Pi0's files). Dexbotic calls q01 and q99 min and max.
 
     Statistics of actions may have shape [1, n]: openpi broadcasts them over the chunk [H, n]. Those of the state must
     be [n]: of others openpi makes a state of two axes, which its `Observation` refuses.
     """
     file = Path(file)
-    stats = read_json(file).get("norm_stats")
+    content = read_json(file)
+    stats = _one_dataset(content, file) if file.name == STARVLAS else content.get("norm_stats")
     if not isinstance(stats, dict) or not all(isinstance(entry, dict) for entry in stats.values()):
         raise CheckpointError(f'{file}: expected {{"norm_stats": {{"state": {{...}}, "actions": {{...}}}}}}')
+    if set(stats) - {"default"} == {"state", "action"}:
+        names = {"min": "q01", "max": "q99"} if "default" in stats else {}
+        stats = {
+            feature.replace("action", "actions"): {names.get(name, name): values for name, values in entry.items()}
+            for feature, entry in stats.items()
+            if feature != "default"
+        }
     if set(stats) != {"state", "actions"}:
         found = listing(sorted(stats)) or "nothing"
         raise CheckpointError(f"{file} has statistics of {found}; expected state and actions")
@@ -147,6 +158,15 @@ def load_norm_stats(file: str | Path) -> NormStats:
     return NormStats(
         **{name: feature_stats(entry, f"{file}: {name}") for name, entry in (stats | {"actions": actions}).items()}
     )
+
+
+def _one_dataset(content: Mapping[str, object], file: Path) -> object:
+    if len(content) != 1:
+        raise CheckpointError(f"{file} has statistics of {listing(sorted(content)) or 'nothing'}; expected one dataset")
+    (stats,) = content.values()
+    if not isinstance(stats, dict):
+        return stats
+    return {name: entry for name, entry in stats.items() if name in ("state", "action")}
 
 
 def _is_row(values: object) -> bool:
@@ -207,6 +227,7 @@ def _below(folder: Path) -> list[Path]:
 def _only(folder: Path) -> tuple[Path, str | None]:
     """The only statistics there are: below assets/, or else anywhere in the checkpoint."""
     places = _below(folder / "assets") or _below(folder)
+    places = places or _starvlas(folder)
     if len(places) > 1:
         raise ConfigError(_ambiguous(folder, places))
     if not places:
@@ -226,7 +247,7 @@ def _of_asset(folder: Path, asset_id: str) -> tuple[Path, str | None]:
         return own, _name(asset_id)
     named, unnamed = _elsewhere(folder, asset_id)
     # without a name in their path they may be those of any asset that is there
-    places = [*named, *unnamed, *([] if named or not unnamed else _below(folder))]
+    places = [*named, *unnamed, *([] if named or not unnamed else _below(folder))] or _starvlas(folder)
     if not places:
         raise CheckpointError(_missing(folder, asset_id))
     if not _all_alike(places):
@@ -239,6 +260,10 @@ def _elsewhere(folder: Path, asset_id: str | None) -> tuple[list[Path], list[Pat
     named = [] if asset_id is None or _leads_out(asset_id) else [folder / asset_id / FILE_NAME]
     unnamed = [folder / "assets" / FILE_NAME, folder / FILE_NAME]
     return [file for file in named if file.is_file()], [file for file in unnamed if file.is_file()]
+
+
+def _starvlas(folder: Path) -> list[Path]:
+    return [file for file in [folder / STARVLAS] if file.is_file()]
 
 
 def _leads_out(path: str) -> bool:

@@ -15,10 +15,10 @@ from turbopi.checkpoint.locate import Location, locate, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
+from turbopi.checkpoint.other_programs import check_state, in_known_layout, statistics_folder
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.quantized_folder import QuantizedSource
-from turbopi.checkpoint.rlinf import in_known_layout
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
@@ -49,14 +49,16 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     if location.format == "lerobot":
         return _open_lerobot(location, settings, source)
     kind, folder = detect_kind(source, location.weights), location.folder
+    assets = statistics_folder(folder, source)
 
     def policy_of(settings: Settings) -> PolicyConfig:
-        return policy_config(settings, kind, assets=asset_ids(folder / "assets"), where=folder)
+        return policy_config(settings, kind, assets=asset_ids(assets / "assets"), where=folder)
 
     chosen = policy_of(settings)
     source, chosen = _with_target_time(source, chosen, settings, location)
+    check_state(source, chosen, settings.source)
     policy = _with_sizes(chosen, source, settings, location)
-    found = find_norm_stats(folder, policy.asset_id, policy.normalization)
+    found = find_norm_stats(assets, policy.asset_id, policy.normalization)
     source.notes += found.notes
     if location.format not in ("onnx", "quantized"):
         source.notes += notes_on_config_json(folder, source, policy)

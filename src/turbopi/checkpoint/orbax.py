@@ -1,10 +1,12 @@
-"""An Orbax tree of arrays in OCDBT, read with tensorstore: neither JAX nor Orbax is needed.
+"""An Orbax tree of arrays, read with tensorstore: neither JAX nor Orbax is needed.
+
+It is an OCDBT store, or has a folder for each array: openpi-comet's training on several machines writes those.
 
 What protects it: OCDBT keeps a CRC-32C with its manifest and with every node of its index, so damage to names, shapes
-and places is found. The chunks of numbers, nearly all of the bytes, have none: zstd frames are written without their
-checksum. Damage there is found if the frame can't be decoded, or if a number becomes NaN or infinite. Other damage
-changes some weights and can't be told from a trained value, except by a hash that was taken before ("weights_sha256"
-in turbopi.json). Chunks that aren't there are an error: tensorstore would read them as zeros.
+and places is found; folders have none. The chunks of numbers, nearly all of the bytes, have none in either: zstd frames
+are written without their checksum. Damage there is found if the frame can't be decoded, or if a number becomes NaN or
+infinite. Other damage changes some weights and can't be told from a trained value, except by a hash that was taken
+before ("weights_sha256" in turbopi.json). Chunks that aren't there are an error: tensorstore would read them as zeros.
 
 A chunk can only be decoded whole. It is decoded once and kept while consecutive indices need it, and files are
 memory-mapped, so that compressed bytes are page cache and not ours.
@@ -32,7 +34,7 @@ _MAX_BYTES = 2**40  # of one array
 
 
 class OrbaxTree:
-    """Paths, shapes and lazily read arrays of an OCDBT store, without the `params.` root and a trailing `value`."""
+    """Paths, shapes and lazily read arrays of a tree, without the `params.` root and a trailing `value`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -43,17 +45,15 @@ class OrbaxTree:
         self._zarr3 = False
         self._sparse: set[str] = set()  # paths whose absent chunks are zeros
         self.empty: set[str] = set()  # paths of which no chunk is stored
-        if not (folder / MANIFEST).is_file():
+        self._ocdbt = (folder / MANIFEST).is_file()
+        if not self._ocdbt and not any(entry.is_dir() for entry in folder.glob("params.*")):
             unfinished = sorted(entry.name for entry in folder.glob("ocdbt.process_*"))
             if unfinished:
                 raise CheckpointError(
                     f"{folder} has {listing(unfinished)}, but no {MANIFEST}, which Orbax writes last: the save was "
                     "interrupted, or the copy is incomplete. Take an earlier step, or copy it anew"
                 )
-            raise CheckpointError(
-                f"{folder} has no {MANIFEST}: either the download is incomplete, or the checkpoint is in Orbax's older "
-                "format of one folder an array, which Turbo-Pi doesn't read; re-save it with openpi's Orbax"
-            )
+            raise CheckpointError(f"{folder} has no {MANIFEST} and no folder params.*: the download is incomplete")
         self._read_metadata()
 
     def open(self, path: str) -> "OrbaxArray":
@@ -79,7 +79,7 @@ class OrbaxTree:
 
         spec = {
             "driver": "zarr3" if self._zarr3 else "zarr",
-            "kvstore": {**self._kvstore_spec(), "path": self._keys[path] + "/"},
+            "kvstore": self._kvstore_spec(self._keys[path] + "/"),
             "fill_missing_data_reads": path in self._sparse,
         }
         try:  # file_io_mode is known since tensorstore 0.1.77
@@ -94,8 +94,10 @@ class OrbaxTree:
             )
         return array
 
-    def _kvstore_spec(self) -> dict[str, Any]:
-        return {"driver": "ocdbt", "base": self.folder.resolve().as_uri() + "/"}
+    def _kvstore_spec(self, below: str = "") -> dict[str, Any]:
+        if self._ocdbt:
+            return {"driver": "ocdbt", "base": self.folder.resolve().as_uri() + "/", "path": below}
+        return {"driver": "file", "path": f"{self.folder.resolve()}/{below}"}
 
     def _read_metadata(self) -> None:
         try:
@@ -112,7 +114,8 @@ class OrbaxTree:
             arrays = {key.removesuffix(suffix) for key in keys if key.endswith(suffix)}
             described = {key: store.read(key + suffix).result().value for key in sorted(arrays)}
         except Exception as reason:  # as in `tensorstore`
-            raise self.damaged(f"it can't be read as an OCDBT store ({one_line(reason)})") from reason
+            kind = "an OCDBT store" if self._ocdbt else "folders of arrays"
+            raise self.damaged(f"it can't be read as {kind} ({one_line(reason)})") from reason
         rootless = [key for key in described if not key.startswith("params.")]
         if rootless or not described:
             what = f"holds {listing(rootless)}" if rootless else "is empty"

@@ -1,4 +1,4 @@
-"""RLinf's own layout of Pi0.5 and Pi0 ("RLinf PyTorch"), and names of other programs whose weights aren't read.
+"""RLinf's own layout of Pi0.5 and Pi0 ("RLinf PyTorch").
 
 Its `model.safetensors` has openpi's JAX tree in PyTorch's clothes: `img.…`, `llm.layers.N.….0` for the language model
 and `.1` for the action expert, both kernels of gate and up in one array [2, in, out]. What RLinf trains it saves as
@@ -9,23 +9,17 @@ Source: that converter.
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from turbopi.checkpoint.source import Piece, Shape, WeightSource, row_ranges
+from turbopi.checkpoint.source import Piece, Shape, row_ranges
 from turbopi.checkpoint.torch_files import ITEMSIZE, TorchSource, read_tensor
 from turbopi.support.errors import CheckpointError
 
 EMBEDDING = "llm.embedder.embedding.weight"
 _STACKS = ("vlm", "expert")
-_OTHERS = {  # beginnings of names -> whose they are
-    "model.llm.": "Dexbotic's",
-    "llm.embed_tokens.": "Dexbotic's",
-    "qwen_vl_interface.": "StarVLA's, whose language model is another",
-}
 
 
 @dataclass(frozen=True)
@@ -116,16 +110,3 @@ class RLinfSource:
             values = part.take(read_tensor(self._file.stored(key)))
             for start, stop in row_ranges(self.shapes[name], ITEMSIZE[self.dtypes[name]]):
                 yield Piece(name, start, values[start:stop])
-
-
-def in_known_layout(file: TorchSource, where: Path) -> WeightSource:
-    """The same source, or RLinf's layout under canonical names. Raises CheckpointError for another program's."""
-    if EMBEDDING in file.shapes:
-        return RLinfSource(file)
-    for beginning, whose in _OTHERS.items():
-        if (found := next((name for name in file.shapes if name.startswith(beginning)), None)) is not None:
-            raise CheckpointError(
-                f"{where} has {file.native_name(found)}: weights in a layout of {whose}, with images, prompts and "
-                "statistics of its own. Turbo-Pi reads openpi's, LeRobot's and RLinf's"
-            )
-    return file

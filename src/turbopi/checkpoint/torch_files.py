@@ -71,12 +71,13 @@ class TorchSource:
         if self._prefix != prefix:
             self.notes.append(f"all names in {WEIGHTS} begin with {self._prefix}: read without it")
         self._stored: dict[str, Stored] = {}
+        current = self.names.current if isinstance(self.names, PiNames) else current_name
         heads: dict[str, Stored] = {}
         self.untied = False  # whether lm_head and the embedding are both stored
         self.head: Stored | None = None  # lm_head, where LeRobot has one beside the embedding
         self.variant = "head" if getattr(self.names, "trains_head", False) else ""  # `Checkpoint.fingerprint` has it
         for stored in stored_tensors:
-            key = current_name(stored.key.removeprefix(self._prefix))
+            key = current(stored.key.removeprefix(self._prefix))
             tied = key in (TIED_HEAD, TIED_EMBEDDING)
             kind, name = (heads, key) if tied else (self._stored, self.names.canonical(key))
             if name is None:
