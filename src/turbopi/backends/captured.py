@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.backends.base import BegunBatch, LoadState, Precision, Sample, StageTimer, Trace
-from turbopi.backends.captured_rows import BegunRows, Images, on_host
+from turbopi.backends.captured_rows import BegunRows, Images, Turn, on_host
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
@@ -84,13 +84,6 @@ class Graphs:
     def size(self) -> Size:
         batch, cameras = self.inputs.image_mask.shape
         return cameras, batch
-
-
-@dataclass(frozen=True, eq=False)
-class Turn:
-    """Observations whose images `graphs` has, until others are begun."""
-
-    graphs: Any  # Graphs, or what a backend has in their place
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """A call's observations in the captured graphs of captured.py: several at once, and one by one."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +13,14 @@ from turbopi.engine.plan import split
 from turbopi.models.observation import Observation, Past, past_of
 from turbopi.models.pi0.conditioning import Conditionings, Form, of_rows
 
-if TYPE_CHECKING:
-    from turbopi.backends.captured import CapturedBackend, Turn
-
 Images = Sequence[np.ndarray]  # of one observation's valid cameras: uint8[h, w, 3], or float32 as the model reads it
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """Observations whose images `graphs` has, until others are begun."""
+
+    graphs: Any  # captured.py's Graphs, or what a backend has in their place
 
 
 class BegunRows:
@@ -28,7 +33,7 @@ class BegunRows:
 
     def __init__(
         self,
-        backend: "CapturedBackend",
+        backend: Any,  # a CapturedBackend
         images: Sequence[Images],
         resize: ImageResize,
         pasts: Sequence[Past],
@@ -45,7 +50,7 @@ class BegunRows:
             plain = plain[size:]
         self._first = self._see(*self._calls[0])
 
-    def _see(self, size: int, rows: Sequence[int]) -> "tuple[Turn, StageTimer]":
+    def _see(self, size: int, rows: Sequence[int]) -> tuple[Turn, StageTimer]:
         timer = StageTimer(self._backend.device)
         images, pasts = [self._images[row] for row in rows], [self._pasts[row] for row in rows]
         turn = self._backend.see(images, self._resize, pasts, None if size == 1 else (self._cameras, size))

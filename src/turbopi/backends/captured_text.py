@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample, StageTimer
-from turbopi.backends.captured import CapturedBackend, Graphs, Seen, Turn
-from turbopi.backends.captured_rows import on_host
+from turbopi.backends.captured import CapturedBackend, Graphs, Seen
+from turbopi.backends.captured_rows import Turn, on_host
 from turbopi.backends.tokens import finished
 from turbopi.config import TextConfig
 from turbopi.engine.graph import Graph, Mark

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Sample, StageTimer, Trace
-from turbopi.backends.captured import CapturedBackend, Turn
+from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.captured_rows import Turn
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.engine.graph import Graph, Mark

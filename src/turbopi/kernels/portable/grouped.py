@@ -64,10 +64,12 @@ def rope_grouped(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Te
 
 
 @triton.jit
-def _add_keys(queries, k, v, at, loaded, visible, scale, acc, top, total):
-    """A block of keys and values into the running softmax."""
+def _add_keys(queries, k, v, first, key, keys, seen, d, DIM: tl.constexpr, scale, acc, top, total):
+    """Some of `keys` keys and values into the running softmax: a row sees those before its `seen`."""
+    loaded = (key < keys)[:, None] & (d < DIM)[None, :]
+    at = (first + key)[:, None] * DIM + d[None, :]
     logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
-    logits = tl.where(visible, logits, -float("inf"))
+    logits = tl.where(key[None, :] < seen[:, None], logits, -float("inf"))
     new_top = tl.maximum(top, tl.max(logits, 1))
     p = tl.exp2(logits - new_top[:, None])
     shrink = tl.exp2(top - new_top)
@@ -101,16 +103,12 @@ def _attention_kernel(
     top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
     total = tl.zeros((BLOCK_M,), tl.float32)
     for start in range(0, end, BLOCK_N):
-        loaded = (start + n < end)[:, None] & (d < DIM)[None, :]
-        at = (block * places + start + n)[:, None] * DIM + d[None, :]
-        visible = (start + n)[None, :] < seen[:, None]
-        acc, top, total = _add_keys(queries, k, v, at, loaded, visible, scale, acc, top, total)
+        acc, top, total = _add_keys(queries, k, v, block * places, start + n, end, seen, d, DIM, scale, acc, top, total)
     if OWN:
         for start in range(0, tokens, BLOCK_N):
-            loaded = (start + n < tokens)[:, None] & (d < DIM)[None, :]
-            at = (block * tokens + start + n)[:, None] * DIM + d[None, :]
-            visible = (start + n)[None, :] <= token[:, None]
-            acc, top, total = _add_keys(queries, own_k, own_v, at, loaded, visible, scale, acc, top, total)
+            acc, top, total = _add_keys(
+                queries, own_k, own_v, block * tokens, start + n, tokens, token + 1, d, DIM, scale, acc, top, total
+            )
     to = ((observation * tokens + token) * heads + kv_head * GROUP + m % GROUP)[:, None] * DIM + d[None, :]
     tl.store(out + to, (acc / total[:, None]).to(out.dtype.element_ty), inside)
 
