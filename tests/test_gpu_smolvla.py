@@ -84,6 +84,19 @@ def test_a_conditioned_loop_and_a_batch_equal_the_references(checkpoints: dict[s
     assert all(relative(a["actions"], b["actions"]) <= 2e-5 for a, b in zip(*rows, strict=True))
 
 
+def test_a_captured_batch_of_other_prompts_and_cameras_gives_lerobots_actions(
+    checkpoints: dict[str, Checkpoint],
+) -> None:
+    for name in ("base", "missing_camera"):
+        policy, golden = UnifiedPolicy(checkpoints[name], precision="f32", backend="cuda_graph"), GoldenRuns(name)
+        runs = [run % len(golden) for run in range(3)]
+        noise = np.stack([golden.noise] * len(runs))
+        together = policy.infer_batch([golden.observation(run) for run in runs], noise=noise)
+        for run, one in zip(runs, together, strict=True):
+            assert relative(one["actions"], golden.actions(run)) <= 2e-5
+        assert policy.metadata["backend_details"]["batches"]
+
+
 # -- fused: its kernels take heads of at least 16 columns, which the golden models haven't; so the published sizes -----
 
 
@@ -151,3 +164,22 @@ def test_a_strict_fused_policy_runs_what_was_warmed_up(published: Checkpoint) ->
     assert np.isfinite(policy.infer(observation)["actions"]).all()
     with pytest.raises(ObservationError, match="warmup"):
         policy.infer(observation, num_steps=7)
+    policy.warmup(cameras=[2], batches=8)
+    for count in (2, 5, 8):
+        assert all(np.isfinite(one["actions"]).all() for one in policy.infer_batch([observation] * count, seed=1))
+
+
+def test_a_fused_batch_of_other_prompts_and_cameras_is_as_near(policies: dict[str, UnifiedPolicy]) -> None:
+    prompts = ["a", "put the red cup on the plate " * 3, "open it"]
+    several = [seen(policies["exact"], 8 + row, 3 - row, prompt) for row, prompt in enumerate(prompts)]
+    for count in (2, 3):
+        exact, ordinary = (
+            [policies[name].infer(one, seed=1 + row)["actions"] for row, one in enumerate(several[:count])]
+            for name in ("exact", "ordinary")
+        )
+        for _ in range(2):
+            fused = [one["actions"] for one in policies["fused"].infer_batch(several[:count], seed=1)]
+            for ours, usual, right in zip(fused, ordinary, exact, strict=True):
+                assert 0 < relative(ours, right) <= 1.5 * relative(usual, right)
+    sizes = policies["fused"].metadata["backend_details"]["batches"]
+    assert sizes == ["2 observations with up to 3 cameras", "4 observations with up to 3 cameras"]

@@ -259,6 +259,12 @@ def _smolvla(target: Target) -> Calls:
         grouped.grouped_attention(q, cache, cache, of(1, dtype=torch.int64))
         grouped.swiglu(of(places, 2 * hidden))
 
+    def several(*, own: bool) -> None:
+        """Attention of the expert's 50 actions of each of two observations."""
+        cache, its, lengths = of(groups, 2 * places, 64), of(groups, 100, 64), of(2, dtype=torch.int64)
+        q = of(groups, 100 * heads // groups, 64)
+        grouped.grouped_suffix_attention(q, cache, cache, lengths, 50, (its, its) if own else None)
+
     def rms(y: tuple[int, ...] | None) -> Any:
         given = None if y is None else of(*y)
         return norms.residual_rms_norm(of(places, width), given, None, of(width, dtype=F32), None, 1e-5)
@@ -269,6 +275,7 @@ def _smolvla(target: Target) -> Calls:
     parts: tuple[tuple[int, ...], ...] = ((), (2,), (3,), (4,))
     return [
         layer,
+        *(partial(several, own=own) for own in (False, True)),
         *(partial(rms, y) for y in (None, *((*one, places, width) for one in parts))),
         *(partial(_layer_norm, 2048, 768, y, {}) for y in (None, *((*one, 2048, 768) for one in parts))),
         *(partial(vision, tile) for tile in attention_candidates("vision_attention", target.capability, 64)),

@@ -73,6 +73,7 @@ class Backend(ABC):
                     form "plain", is the ordinary call to the last bit
     begins          whether it has `begin_batch`: it resizes images and starts on them before prompts are known
     runs_batches    whether it runs a batch sooner than its observations one by one, by `begin_batch`
+    batch_forms     those of `forms`, beside "plain", of which it runs several together
     submits         whether it has `submit`: several observations may be in flight
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
@@ -86,6 +87,7 @@ class Backend(ABC):
     forms: ClassVar[tuple[Form, ...]] = ()
     begins: ClassVar[bool] = False
     runs_batches: ClassVar[bool] = False
+    batch_forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
     submits: ClassVar[bool] = False
     writes: ClassVar[bool] = False
     strict = False

@@ -5,9 +5,12 @@ A reference whose own methods are other ones gives the captured ones by its `sta
 An observation is three kinds of graph for so many cameras: "vision", "prefix", for a prompt of any length, and "step",
 one evaluation of the expert. The loop around the steps is the reference's own (`integrate`), so it takes whatever that
 does but gradients. Images are resized on the device.
+
+Several observations are the same graphs with a row for each: cameras that an observation hasn't are masked. Those that
+aren't plain (`Conditioning.form`) run alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -17,13 +20,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.backends.base import BegunBatch, LoadState, Precision, Sample, StageTimer, Trace
+from turbopi.backends.captured_rows import BegunRows, Images, Turn, on_host
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.config import ImageResize, Network, empty_cameras, memory_of
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.plan import cold_call
+from turbopi.engine.loops import batch_form
+from turbopi.engine.plan import cold_call, split
 from turbopi.engine.resize import Resizer
 from turbopi.models.observation import Observation, Past, PastObservation, past_of, remembering
 from turbopi.models.pi0.conditioning import Conditioning, Conditionings, Form, of_rows
@@ -33,12 +38,12 @@ from turbopi.preprocess.images import fit_unit
 from turbopi.support.errors import BackendError
 from turbopi.support.toolchain import make_caches_writable
 
-Images = Sequence[np.ndarray]  # of one observation's valid cameras: uint8[h, w, 3], or float32 as the model reads it
+Size = tuple[int, int]  # of a call: cameras and observations
 
 
 @dataclass
 class _Step:
-    """A captured evaluation of the expert: x float32[1, H, A], time float32[1, D] or [1, H, D], v as x."""
+    """A captured evaluation of the expert: x float32[B, H, A], time float32[1, D] or [1, H, D], v as x."""
 
     x: Tensor
     time: Tensor
@@ -48,7 +53,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class Answer:
-    """Actions float32[1, H, A], on the device; each evaluation's x_t and v_t, of the same shape, if they were kept."""
+    """Actions float32[B, H, A], on the device; each evaluation's x_t and v_t, of the same shape, if they were kept."""
 
     actions: Tensor
     evaluations: list[tuple[Tensor, Tensor]]
@@ -56,7 +61,7 @@ class Answer:
 
 @dataclass
 class Graphs:
-    """Of so many cameras: the inputs' places, what the prefix leaves, and what is captured behind it.
+    """Of so many observations and cameras: the inputs' places, what the prefix leaves, and what is captured behind it.
 
     resizer what the vision graph resizes bytes by; None: it doesn't
     behind  what the reference's expert makes of the cache once a call
@@ -74,6 +79,11 @@ class Graphs:
     more: Any
     steps: dict[tuple[int, bool], _Step] = field(default_factory=dict)
     loops: dict[tuple[int, int], Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> Size:
+        batch, cameras = self.inputs.image_mask.shape
+        return cameras, batch
 
 
 @dataclass(frozen=True)
@@ -93,6 +103,10 @@ class CapturedBackend(PyTorchBackend):
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens")
     writes: ClassVar[bool] = False
     begins: ClassVar[bool] = True
+    runs_batches: ClassVar[bool] = True
+    batch_forms: ClassVar[tuple[Form, ...]] = ()
+    # predicted for SmolVLA on an H200 (docs/dev/log/batches.md); a server measures its own
+    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.15, 4: 1.4, 8: 2}
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -113,11 +127,11 @@ class CapturedBackend(PyTorchBackend):
         self._stages = self._make_stages()
         if self.precision == "bf16" and hasattr(self.model, "attend"):
             self.model.attend = _attend
-        self._graphs: dict[int, Graphs] = {}  # by number of cameras
+        self._graphs: dict[Size, Graphs] = {}
         self._pool = torch.cuda.graph_pool_handle()
         self._stream: torch.cuda.Stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
         self._times: dict[bytes, Tensor] = {}
-        self._turn: object = None  # of the observation whose images are in the inputs
+        self._turn: Turn | None = None  # of the observations whose images are in the inputs
         self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
         self._embed_images, self._prefix_of, self._velocity = map(self._stage, self._to_compile)
 
@@ -139,19 +153,38 @@ class CapturedBackend(PyTorchBackend):
         if conditioning is not None and conditioning.form == "tokens":
             self._step(graphs, horizon or self.config.action_horizon, by_action=True)
 
+    @property
+    def batch_costs(self) -> Mapping[int, float]:
+        return self.COSTS if self.runs_batches else {1: 1}
+
+    def warmup_batches(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None,
+        batches: Sequence[int],
+        conditioning: Conditioning | None = None,
+    ) -> None:
+        if conditioning is not None and conditioning.form != "plain":
+            return
+        for size in sorted({size for count in batches for size in split(count, self.batch_costs)} - {1}):
+            graphs = self._captured(int(observation.image_mask[0].sum()), size)
+            self._prepare_loop(graphs, num_steps, horizon or self.config.action_horizon)
+
     def begin_batch(
         self,
         images: Sequence[Images],
         resize: ImageResize | None = None,
         forms: Sequence[Form] | None = None,
     ) -> BegunBatch:
-        return _Begun(self, images, resize or "lerobot", [Past()] * len(images))
+        return BegunRows(self, images, resize or "lerobot", [Past()] * len(images), forms or ["plain"] * len(images))
 
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        images, pasts, tokens, state = _on_host(observation)
-        begun = _Begun(self, images, "lerobot", pasts)
+        images, pasts, tokens, state = on_host(observation)
+        forms = [batch_form(one) for one in of_rows(conditioning, len(images))]
+        begun = BegunRows(self, images, "lerobot", pasts, forms)
         return begun.finish(tokens, state, noise.cpu().numpy(), num_steps, conditioning)
 
     def prefix(self, observation: Observation) -> KVCache:
@@ -165,14 +198,14 @@ class CapturedBackend(PyTorchBackend):
     ) -> Trace:
         """Of the captured graphs, one observation after the other: places of the prefix that none has are 0."""
         self.check_conditioning(conditioning)
-        images, pasts, tokens, state = _on_host(observation)
+        images, pasts, tokens, state = on_host(observation)
         traces = []
         for row, one in enumerate(of_rows(conditioning, len(tokens))):
-            turn = self.see(images[row], "lerobot", pasts[row])
-            inputs = tokens[row], state[row], noise[row].cpu().numpy()
-            timer = StageTimer(self.device)
-            done = self.answer(turn, len(images[row]), *inputs, num_steps, one, timer, keep=True)
-            cache = self._graphs[len(images[row])].cache
+            its = slice(row, row + 1)
+            turn = self.see(images[its], "lerobot", pasts[its])
+            inputs = tokens[its], state[its], noise[its].cpu().numpy()
+            done = self.answer(turn, *inputs, num_steps, one, StageTimer(self.device), keep=True)
+            cache = turn.graphs.cache
             assert cache.mask is not None
             parts = {name: part[:, :, :, cache.mask[0]] for name, part in _parts(cache)}
             if isinstance(observation, PastObservation):
@@ -184,35 +217,53 @@ class CapturedBackend(PyTorchBackend):
         return {name: _joined([one[name] for one in traces], int(name != "actions")) for name in traces[0]}
 
     def describe(self) -> dict[str, Any]:
-        return {"compiled": self._compiles, "cameras": sorted(self._graphs)}
+        sizes = sorted(self._graphs)
+        described = {"compiled": self._compiles, "cameras": [cameras for cameras, batch in sizes if batch == 1]}
+        batches = [f"{batch} observations with up to {cameras} cameras" for cameras, batch in sizes if batch > 1]
+        return described | ({"batches": batches} if batches else {})
 
-    # -- one observation -----------------------------------------------------------------------------------------------
+    # -- one observation, or several -----------------------------------------------------------------------------------
 
-    def see(self, images: Images, resize: ImageResize, past: Past) -> object:
-        """Start on its images, and those before; what `answer` needs to know that nobody else has started since."""
-        if self.strict and len(images) not in self._graphs:
-            raise self._cold(len(images), self.config.action_horizon)
-        graphs = self._captured(len(images))
-        places = graphs.inputs.images[0]
-        for image, place in zip(images, places, strict=True):
-            if image.dtype == np.float32:  # as the model reads it
+    def see(
+        self, images: Sequence[Images], resize: ImageResize, pasts: Sequence[Past], size: Size | None = None
+    ) -> Turn:
+        """Start on the images of observations, and those before; what `answer` needs of it.
+
+        size  of the graphs, for at least so many; None: of one observation's
+        """
+        cameras, batch = size or (len(images[0]), 1)
+        if self.strict and (cameras, batch) not in self._graphs:
+            raise self._cold((cameras, batch), self.config.action_horizon)
+        graphs = self._captured(cameras, batch)
+        given = [
+            images[row][camera] if row < len(images) and camera < len(images[row]) else None
+            for row in range(batch)
+            for camera in range(cameras)
+        ]
+        for image, place in zip(given, graphs.inputs.images.flatten(0, 1), strict=True):
+            if image is None:
+                place.zero_()  # what was there before may be NaN, which no mask takes away
+            elif image.dtype == np.float32:  # as the model reads it
                 place.copy_(torch.from_numpy(image))
             elif graphs.resizer is None:
                 on_device = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
                 place.copy_(fit_unit(on_device[None].float() / 255, tuple(place.shape[:2]), resize)[0])
         if graphs.resizer is not None:
-            graphs.resizer.upload([None if one.dtype == np.float32 else one for one in images], resize)
-        for name, place in past_of(graphs.inputs).parts.items():
-            place.copy_(getattr(past, name))
+            graphs.resizer.upload([None if one is None or one.dtype == np.float32 else one for one in given], resize)
+        if batch > 1:
+            there = np.array([one is not None for one in given]).reshape(batch, cameras)
+            graphs.inputs.image_mask.copy_(torch.from_numpy(there))
+        for row, past in enumerate(pasts):
+            for name, part in past.parts.items():
+                past_of(graphs.inputs).parts[name][row : row + 1, : part.shape[1]].copy_(part)
         graphs.vision.launch()
-        self._turn = object()
+        self._turn = Turn(graphs)
         return self._turn
 
     def answer(
         self,
-        turn: object,
-        cameras: int,
-        tokens: np.ndarray,
+        turn: Turn,
+        tokens: Sequence[np.ndarray],
         state: np.ndarray,
         noise: np.ndarray,
         num_steps: int,
@@ -221,31 +272,33 @@ class CapturedBackend(PyTorchBackend):
         *,
         keep: bool = False,
     ) -> Answer:
-        """Its actions; keep: and all that led to them."""
-        graphs = self._captured(cameras)
-        self._give_prompt(turn, graphs.inputs, tokens)
-        graphs.inputs.state.copy_(torch.from_numpy(state)[None])
+        """Actions of the observations, the first of so many rows as the graphs have; keep: and all that led to them."""
+        graphs: Graphs = turn.graphs
+        self._give_prompts(turn, tokens)
+        graphs.inputs.state[: len(state)].copy_(torch.from_numpy(state))
         graphs.prefix.launch()
         timer.mark("prefix")
-        x_1 = torch.from_numpy(noise)[None].to(self.device)
-        answer = self._denoise(graphs, cameras, x_1, num_steps, conditioning, keep)
+        x_1 = torch.zeros(len(graphs.inputs.state), *noise.shape[1:])
+        x_1[: len(noise)] = torch.from_numpy(noise)
+        answer = self._denoise(graphs, x_1.to(self.device), num_steps, conditioning, keep)
         timer.mark("denoise")
         return answer
 
-    def _give_prompt(self, turn: object, inputs: Observation, tokens: np.ndarray) -> None:
-        """Put it behind the images that `see` has begun on."""
+    def _give_prompts(self, turn: Turn, tokens: Sequence[np.ndarray]) -> None:
+        """Put them behind the images that `see` has begun on."""
         if turn is not self._turn:
             raise BackendError("another observation was begun before this one was finished")
-        padded = np.zeros((2, self.config.max_prompt_tokens), np.int64)
-        padded[0, : len(tokens)], padded[1, : len(tokens)] = tokens, 1
+        inputs = turn.graphs.inputs
+        padded = np.zeros((2, *inputs.tokens.shape), np.int64)
+        for row, one in enumerate(tokens):
+            padded[0, row, : len(one)], padded[1, row, : len(one)] = one, 1
         on_device = torch.from_numpy(padded).to(self.device)
-        inputs.tokens.copy_(on_device[:1])
-        inputs.token_mask.copy_(on_device[1:])
+        inputs.tokens.copy_(on_device[0])
+        inputs.token_mask.copy_(on_device[1])
 
     def _denoise(
         self,
         graphs: Graphs,
-        cameras: int,
         x_1: Tensor,
         num_steps: int,
         conditioning: Conditioning | None,
@@ -253,7 +306,7 @@ class CapturedBackend(PyTorchBackend):
     ) -> Answer:
         def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
             if self.strict and (x.shape[1], time.ndim == 3) not in graphs.steps:
-                raise self._cold(cameras, x.shape[1], conditioned=time.ndim == 3)
+                raise self._cold(graphs.size, x.shape[1], conditioned=time.ndim == 3)
             step = self._step(graphs, x.shape[1], by_action=time.ndim == 3)
             step.x.copy_(x)
             step.time.copy_(time)
@@ -275,7 +328,9 @@ class CapturedBackend(PyTorchBackend):
         return self._stages.embed_images, self._prefix_stage, self._stages.velocity
 
     def _vision(self, observation: Observation, mark: Mark) -> Tensor:
-        return self._embed_images(observation if isinstance(observation, PastObservation) else observation.images[0])
+        if isinstance(observation, PastObservation):
+            return self._embed_images(observation)
+        return self._embed_images(observation.images.transpose(0, 1).flatten(0, 1))
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, Any]:
         prefix = self._stages.embed_prefix(observation, embedded=embedded)
@@ -283,24 +338,31 @@ class CapturedBackend(PyTorchBackend):
         cache = self._stages.cache_of(prefix, k, v)
         return cache, self._stages.cross_keys_values(cache), None
 
-    def _captured(self, cameras: int) -> Graphs:
-        if cameras not in self._graphs:
-            with building(self.device), torch.no_grad():
-                self._graphs[cameras] = self._capture(cameras)
-        return self._graphs[cameras]
+    def is_warm(self, *size: int) -> bool:
+        return size in self._graphs
 
-    def _inputs(self, cameras: int) -> Observation:
+    def _captured(self, cameras: int, batch: int = 1) -> Graphs:
+        if (cameras, batch) not in self._graphs:
+            with building(self.device), torch.no_grad():
+                self._graphs[cameras, batch] = self._capture(cameras, batch)
+        return self._graphs[cameras, batch]
+
+    def _prepare_loop(self, graphs: Graphs, num_steps: int, horizon: int) -> None:
+        """Of several plain observations."""
+        self._step(graphs, horizon, by_action=False)
+
+    def _inputs(self, cameras: int, batch: int) -> Observation:
         config, side, prompt = self.config, self.config.image_size, self.config.max_prompt_tokens
         return Observation(
-            torch.zeros(1, cameras, side, side, 3),
-            torch.ones(1, cameras, dtype=torch.bool),
-            torch.zeros(1, prompt, dtype=torch.int64),
-            torch.ones(1, prompt, dtype=torch.bool),
-            torch.zeros(1, config.state_dim),
+            torch.zeros(batch, cameras, side, side, 3),
+            torch.ones(batch, cameras, dtype=torch.bool),
+            torch.zeros(batch, prompt, dtype=torch.int64),
+            torch.ones(batch, prompt, dtype=torch.bool),
+            torch.zeros(batch, config.state_dim),
         ).to(self.device)
 
-    def _capture(self, cameras: int) -> Graphs:
-        inputs = self._inputs(cameras)
+    def _capture(self, cameras: int, batch: int) -> Graphs:
+        inputs = self._inputs(cameras, batch)
         if (memory := memory_of(self.config)) is not None:
             inputs = remembering(inputs, memory)
         seen = self._seen(inputs)
@@ -316,15 +378,16 @@ class CapturedBackend(PyTorchBackend):
         return Graphs(inputs, seen.resizer, seen.graph, second, *left[0])
 
     def _seen(self, inputs: Observation) -> Seen:
-        """The captured vision of an observation that lies in `inputs`."""
-        resizer = Resizer(inputs.images[0]) if self._compiles else None  # Triton's kernel needs a compiler, too
+        """The captured vision of observations that lie in `inputs`."""
+        places = inputs.images.flatten(0, 1)
+        resizer = Resizer(places) if self._compiles else None  # Triton's kernel needs a compiler, too
         images: list[Tensor] = []
 
         def vision(mark: Mark) -> None:
             if resizer is not None:
                 from turbopi.kernels.portable.resize import resize_images
 
-                resize_images(resizer.table, inputs.images[0])
+                resize_images(resizer.table, places)
             images[:] = [self._vision(inputs, mark)]
             mark("vision")
 
@@ -333,7 +396,7 @@ class CapturedBackend(PyTorchBackend):
 
     def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> _Step:
         if (horizon, by_action) not in graphs.steps:
-            x = torch.zeros(1, horizon, self.config.action_dim, device=self.device)
+            x = torch.zeros(len(graphs.inputs.state), horizon, self.config.action_dim, device=self.device)
             time = self._embed_times(np.ones(1, np.float32))
             time = time[:, None].repeat(1, horizon, 1) if by_action else time.clone()
             made: list[Tensor] = []
@@ -347,14 +410,15 @@ class CapturedBackend(PyTorchBackend):
             graphs.steps[horizon, by_action] = _Step(x, time, made[1], graph)
         return graphs.steps[horizon, by_action]
 
-    def _cold(self, cameras: int, horizon: int, *, conditioned: bool = False) -> Exception:
-        warm = [
-            f"{count} cameras, H={h}"
-            for count, one in self._graphs.items()
-            for h in {h for h, _ in (*one.steps, *one.loops)}
-        ]
-        needs = f"{cameras} cameras, H={horizon}"
-        return cold_call(self.name, needs, warm, conditioned=conditioned, cameras=cameras, horizons=horizon)
+    def _cold(self, size: Size, horizon: int, *, conditioned: bool = False) -> Exception:
+        def named(size: Size, horizon: int) -> str:
+            cameras, batch = size
+            return ("" if batch == 1 else f"{batch} observations, ") + f"{cameras} cameras, H={horizon}"
+
+        warm = [named(of, h) for of, one in self._graphs.items() for h in {h for h, _ in (*one.steps, *one.loops)}]
+        cameras, batch = size
+        needs = {"cameras": cameras, "horizons": horizon, **({} if batch == 1 else {"batches": batch})}
+        return cold_call(self.name, named(size, horizon), warm, conditioned=conditioned, **needs)
 
     def _embed_times(self, times: np.ndarray) -> Tensor:
         key = times.tobytes()
@@ -363,49 +427,6 @@ class CapturedBackend(PyTorchBackend):
                 self._times.clear()
             self._times[key] = self._stages.embed_times(times).to(self.device)
         return self._times[key]
-
-
-class _Begun:
-    """`BegunBatch` of observations that run one by one; the device works on the first one's images already."""
-
-    def __init__(
-        self, backend: CapturedBackend, images: Sequence[Images], resize: ImageResize, pasts: Sequence[Past]
-    ) -> None:
-        self._backend, self._images, self._resize, self._pasts = backend, images, resize, pasts
-        self._timer = StageTimer(backend.device)
-        self._turn = backend.see(images[0], resize, pasts[0])
-        self._timer.mark("vision")
-
-    def finish(
-        self,
-        tokens: Sequence[np.ndarray],
-        state: np.ndarray,
-        noise: np.ndarray,
-        num_steps: int,
-        conditioning: Conditionings = None,
-    ) -> Sample:
-        self._backend.check_conditioning(conditioning)
-        each = of_rows(conditioning, len(tokens))
-        actions, stages = [], []
-        for row, one in enumerate(each):
-            if row:
-                self._timer = StageTimer(self._backend.device)
-                self._turn = self._backend.see(self._images[row], self._resize, self._pasts[row])
-                self._timer.mark("vision")
-            inputs = (tokens[row], state[row], noise[row], num_steps, one)
-            made = self._backend.answer(self._turn, len(self._images[row]), *inputs, self._timer)
-            actions.append(made.actions.cpu())
-            stages.append(self._timer.milliseconds())
-        return Sample(torch.cat(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
-
-
-def _on_host(observation: Observation) -> tuple[list[Images], list[Past], list[np.ndarray], np.ndarray]:
-    """Of each observation its valid images, those before, and prompt tokens; and the states."""
-    host = observation.to("cpu")
-    rows = range(host.batch_size)
-    images: list[Images] = [list(host.images[row][host.image_mask[row]].numpy()) for row in rows]
-    pasts = [past_of(host.row(row)).of_cameras(host.image_mask[row]) for row in rows]
-    return images, pasts, [host.tokens[row][host.token_mask[row]].numpy() for row in rows], host.state.numpy()
 
 
 def _parts(cache: KVCache) -> tuple[tuple[str, Tensor], tuple[str, Tensor]]:

@@ -4,7 +4,7 @@ Beside those of captured.py an observation has two graphs, for so many cameras: 
 any length, with the first id, and "step", one more id (tokens.py). Both prompts use the images that "vision" embedded.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample, StageTimer
-from turbopi.backends.captured import CapturedBackend, Graphs, Seen, _on_host
+from turbopi.backends.captured import CapturedBackend, Graphs, Seen
+from turbopi.backends.captured_rows import Turn, on_host
 from turbopi.backends.tokens import finished
 from turbopi.config import TextConfig
 from turbopi.engine.graph import Graph, Mark
@@ -52,6 +53,7 @@ class CapturedTextBackend(CapturedBackend):
     """The reference of Pi0.5 in CUDA graphs; a token by the engine's kernels where its sizes are for that."""
 
     writes: ClassVar[bool] = True
+    runs_batches: ClassVar[bool] = False
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(load)
@@ -79,23 +81,23 @@ class CapturedTextBackend(CapturedBackend):
         if not isinstance(observation, SeenObservation) or observation.seen is None:
             return super().sample(observation, noise, num_steps, conditioning=conditioning)
         self.check_conditioning(conditioning)
-        (one,), (turn, cameras) = of_rows(conditioning, 1), observation.seen
+        (one,) = of_rows(conditioning, 1)
         timer, self._causal = StageTimer(self.device), observation.causal
-        inputs = observation.tokens[0].numpy(), observation.state[0].numpy(), noise[0].cpu().numpy()
-        made = self.answer(turn, cameras, *inputs, num_steps, one, timer)
+        inputs = [observation.tokens[0].numpy()], observation.state.numpy(), noise.cpu().numpy()
+        made = self.answer(observation.seen, *inputs, num_steps, one, timer)
         return Sample(made.actions.cpu(), timer.milliseconds())
 
-    def see_images(self, observation: Observation) -> tuple[object, int]:
+    def see_images(self, observation: Observation) -> Turn:
         """Start on one observation's images: what `write` and `sample` need of it."""
-        (images,), *_ = _on_host(observation)
-        return self.see(images, "lerobot", Past()), len(images)
+        images, *_ = on_host(observation)
+        return self.see(images, "lerobot", [Past()])
 
-    def write(self, turn: object, cameras: int, tokens: np.ndarray, most: int) -> list[int]:
+    def write(self, turn: Turn, tokens: np.ndarray, most: int) -> list[int]:
         """The ids behind a prompt, to EOS or `most` of them, at most those of the policy's `text`."""
-        graphs, text = self._graphs[cameras], self._texts[cameras]
+        text = self._texts[turn.graphs.size[0]]
         if most > text.decoding.ids.shape[1]:
             raise BackendError(f"{most} tokens were requested; there is room for {text.decoding.ids.shape[1]}")
-        self._give_prompt(turn, graphs.inputs, tokens)
+        self._give_prompts(turn, [tokens])
         text.text.launch()
         return finished(text.decoding, text.step, TO_EOS, most)[0]
 
@@ -104,17 +106,17 @@ class CapturedTextBackend(CapturedBackend):
     def _make_stages(self) -> Any:
         return _Stages(self.model)
 
-    def _inputs(self, cameras: int) -> Observation:
-        inputs = super()._inputs(cameras)
+    def _inputs(self, cameras: int, batch: int) -> Observation:
+        inputs = super()._inputs(cameras, batch)
         return SeenObservation.of(inputs, causal=torch.zeros_like(inputs.token_mask)) if self._is_joint else inputs
 
     @property
     def _is_joint(self) -> bool:
         return self._text.subtasks is not None and self._text.subtasks.joint
 
-    def _give_prompt(self, turn: object, inputs: Observation, tokens: np.ndarray) -> None:
-        super()._give_prompt(turn, inputs, tokens)
-        causal, self._causal = self._causal, None
+    def _give_prompts(self, turn: Turn, tokens: Sequence[np.ndarray]) -> None:
+        super()._give_prompts(turn, tokens)
+        inputs, causal, self._causal = turn.graphs.inputs, self._causal, None
         if isinstance(inputs, SeenObservation) and inputs.causal is not None:
             inputs.causal.zero_()
             if causal is not None:
@@ -125,8 +127,8 @@ class CapturedTextBackend(CapturedBackend):
         self._embedded = seen.embedded
         return seen
 
-    def _capture(self, cameras: int) -> Graphs:
-        graphs = super()._capture(cameras)
+    def _capture(self, cameras: int, batch: int) -> Graphs:
+        graphs = super()._capture(cameras, batch)
         inputs, embedded = graphs.inputs, self._embedded
         assert embedded is not None
         places = cameras * self.config.vision.num_tokens + self.config.max_prompt_tokens
@@ -171,5 +173,4 @@ class _Writer:
 
     def write(self, observation: Observation, most: int) -> tuple[list[int], None]:
         assert isinstance(observation, SeenObservation)
-        turn, cameras = observation.seen
-        return self._backend.write(turn, cameras, observation.tokens[0].numpy(), most), None
+        return self._backend.write(observation.seen, observation.tokens[0].numpy(), most), None

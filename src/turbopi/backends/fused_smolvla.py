@@ -1,9 +1,10 @@
 """Backend `fused` for SmolVLA: its stages with kernels of our own (engine/smolvla.py), a call's steps in one launch.
 
 Steps of a conditioned call, which that kernel doesn't take, run as in `cuda_graph`: the reference's, captured. So do
-all where that kernel failed its self-test.
+all where that kernel failed its self-test. Those of several observations are operations (engine/smolvla_batch.py).
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,6 +19,7 @@ from turbopi.backends.tuned_tiles import tiles_of
 from turbopi.config import Network
 from turbopi.engine import smolvla
 from turbopi.engine.graph import HEAD, Graph, Mark, building
+from turbopi.engine.smolvla_batch import ExpertByOps
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
@@ -29,29 +31,32 @@ from turbopi.models.smolvla.config import SmolVLAConfig
 
 @dataclass(frozen=True)
 class _Attended:
-    """What the expert attends to: keys, values bfloat16[L, G, S, K], of which `length` int64[1] places are valid."""
+    """What the expert attends to: keys, values bfloat16[L, G, B * S, K], of which `lengths` int64[B] are valid."""
 
     keys: Tensor
     values: Tensor
-    length: Tensor
+    lengths: Tensor
 
 
 @dataclass(frozen=True)
 class _Loop:
-    """A captured loop: noise float32[H, A], x_t [N + 1, H, A], v_t [N, H, A]."""
+    """A captured loop: noise float32[B, H, A], x_t [N + 1, B, H, A], v_t [N, B, H, A], and what it points to."""
 
     noise: Tensor
     x_t: Tensor
     v_t: Tensor
-    kernel: PortableDenoiser
+    by: Any
     graph: Graph
 
 
 class FusedSmolVLABackend(CapturedBackend):
-    """In bfloat16. A batch's observations run one by one."""
+    """In bfloat16."""
 
     name: ClassVar[str] = "fused"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    # predicted, as the base's: one observation has the denoising kernel, several don't
+    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.65, 4: 2.1, 8: 3.05}
+    _dtype: ClassVar[torch.dtype] = torch.bfloat16
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -70,11 +75,12 @@ class FusedSmolVLABackend(CapturedBackend):
         super().load_weights(load)
         self._tiles, self._without = tiles_of(self.device), excluded(self.device, self.precision, self.config)
         ops = self._make_ops()
-        self._tower = smolvla.Vision.pack(self.model, ops, torch.bfloat16)
-        self._prefix = smolvla.Prefix.pack(self.model, ops, torch.bfloat16)
+        self._tower = smolvla.Vision.pack(self.model, ops, self._dtype)
+        self._prefix = smolvla.Prefix.pack(self.model, ops, self._dtype)
         self._prefix_of = self._prefix_stage
         self._expert = smolvla.Expert.pack(self.model)
-        self._origin = ops.origin
+        self._ops, self._origin = ops, ops.origin
+        self._by_ops: ExpertByOps | None = None  # its matrices are made for the first batch
 
     def _make_ops(self) -> Ops:
         return fused_ops(self.device, self._tiles.table, self._without)
@@ -102,63 +108,85 @@ class FusedSmolVLABackend(CapturedBackend):
             self._step(graphs, actions, by_action=conditioning is not None and conditioning.form == "tokens")
 
     def describe(self) -> dict[str, Any]:
-        loops = sorted({f"{steps} steps, H={h}" for graphs in self._graphs.values() for h, steps in graphs.loops})
+        single = [graphs for (_, batch), graphs in self._graphs.items() if batch == 1]
+        loops = sorted({f"{steps} steps, H={h}" for graphs in single for h, steps in graphs.loops})
         denoising = {"one portable CUDA kernel": loops, "a captured step at a time": ["conditioned calls"]}
         if DENOISE in self._without:
-            denoising = {"a captured step at a time": ["all calls"]}
+            denoising = {"a captured step at a time": ["calls of one observation"]}
+        if self._by_ops is not None:
+            denoising["operations"] = ["calls of several observations"]
         made = {"operations": dict(self._origin), "tiles": self._tiles.about, "denoising": denoising}
         return super().describe() | made | ({"excluded": dict(self._without)} if self._without else {})
 
     def _vision(self, observation: Observation, mark: Mark) -> Tensor:
-        return self._tower(observation.images[0], lambda: mark(HEAD))
+        return self._tower(observation.images.flatten(0, 1), lambda: mark(HEAD))
 
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, _Attended]:
-        config, prefix, cameras = self.config, self._prefix, embedded.shape[0]
-        length = observation.token_mask.sum(1) + prefix.before_prompt(cameras) + 1
-        x = prefix.embed(embedded, observation.tokens[0], observation.state, length)
-        k, v = prefix.keys_values(x, length)
-        valid = torch.arange(len(x), device=self.device)[None] < length
-        cache = KVCache(k[:, None], v[:, None], valid, length, x[None, :0].float())
+        config, prefix, batch = self.config, self._prefix, observation.batch_size
+        if batch == 1:
+            lengths = observation.token_mask.sum(1) + prefix.before_prompt(len(embedded)) + 1
+            x = prefix.embed(embedded, observation.tokens[0], observation.state, lengths)
+        else:
+            x, lengths = prefix.embed_several(embedded, observation)
+        k, v = prefix.keys_values(x, lengths)
+        valid = torch.arange(len(x) // batch, device=self.device)[None] < lengths[:, None]
         keys, values = (one.contiguous() for one in prefix.of_expert(k, v))
+
+        def by_row(rows: Tensor) -> Tensor:
+            """[layer, G, B * S, K] -> [layer, B, G, S, K]"""
+            layers, groups, _, head_dim = rows.shape
+            return rows.view(layers, groups, batch, -1, head_dim).transpose(1, 2)
+
+        cache = KVCache(by_row(k), by_row(v), valid, lengths, x.new_zeros(batch, 0, x.shape[1], dtype=torch.float32))
         across = [
-            None if config.is_self_layer(at) else (keys[i, None], values[i, None])
-            for i, at in enumerate(config.expert_at)
+            None if config.is_self_layer(at) else pair
+            for at, pair in zip(config.expert_at, zip(by_row(keys), by_row(values), strict=True), strict=True)
         ]
-        return cache, across, _Attended(keys, values, length)
+        return cache, across, _Attended(keys, values, lengths)
 
     def _denoise(
-        self,
-        graphs: Graphs,
-        cameras: int,
-        x_1: Tensor,
-        num_steps: int,
-        conditioning: Conditioning | None,
-        keep: bool,
+        self, graphs: Graphs, x_1: Tensor, num_steps: int, conditioning: Conditioning | None, keep: bool
     ) -> Answer:
-        if self._by_step(conditioning):
-            return super()._denoise(graphs, cameras, x_1, num_steps, conditioning, keep)
-        horizon = x_1.shape[1]
+        batch, horizon = x_1.shape[:2]
+        if batch == 1 and self._by_step(conditioning):
+            return super()._denoise(graphs, x_1, num_steps, conditioning, keep)
         if self.strict and (horizon, num_steps) not in graphs.loops:
-            raise self._cold(cameras, horizon)
+            raise self._cold(graphs.size, horizon)
         loop = self._loop(graphs, horizon, num_steps)
-        loop.noise.copy_(x_1[0])
+        loop.noise.copy_(x_1)
         loop.graph.launch()
-        x_t, v_t = loop.x_t[:, None], loop.v_t[:, None]
-        return Answer(x_t[-1], list(zip(x_t[:-1].clone(), v_t.clone(), strict=True)) if keep else [])
+        return Answer(loop.x_t[-1], list(zip(loop.x_t[:-1].clone(), loop.v_t.clone(), strict=True)) if keep else [])
+
+    def _prepare_loop(self, graphs: Graphs, num_steps: int, horizon: int) -> None:
+        self._loop(graphs, horizon, num_steps)
 
     def _loop(self, graphs: Graphs, horizon: int, num_steps: int) -> _Loop:
         if (horizon, num_steps) not in graphs.loops:
             attended: _Attended = graphs.more
-            noise = torch.zeros(horizon, self.config.action_dim, device=self.device)
-            x_t, v_t = noise.new_zeros(num_steps + 1, *noise.shape), noise.new_zeros(num_steps, *noise.shape)
-            rows = attended.keys.shape[2]
+            chunks = (len(attended.lengths), horizon, self.config.action_dim)
+            noise = torch.zeros(chunks, device=self.device)
+            x_t, v_t = noise.new_zeros(num_steps + 1, *chunks), noise.new_zeros(num_steps, *chunks)
             with building(self.device), torch.no_grad():
-                kernel = self._make_denoiser(num_steps, cache_rows=rows, suffix=horizon)
+                by = self._one_denoised if len(attended.lengths) == 1 else self._several_denoised
+                made, launch = by(attended, noise, x_t, v_t)
 
                 def run(mark: Mark) -> None:
-                    kernel.launch(noise, attended.keys, attended.values, attended.length, x_t, v_t)
+                    launch()
                     mark("denoise")
 
                 graph = Graph(run, self._pool, self._stream)
-            graphs.loops[horizon, num_steps] = _Loop(noise, x_t, v_t, kernel, graph)
+            graphs.loops[horizon, num_steps] = _Loop(noise, x_t, v_t, made, graph)
         return graphs.loops[horizon, num_steps]
+
+    def _one_denoised(self, attended: _Attended, *chunks: Tensor) -> tuple[Any, Callable[[], None]]:
+        """The kernel of all steps, and what launches it. chunks: of a `_Loop`, in their order."""
+        noise, x_t, v_t = chunks[0][0], chunks[1][:, 0], chunks[2][:, 0]
+        kernel = self._make_denoiser(len(v_t), cache_rows=attended.keys.shape[2], suffix=len(noise))
+        return kernel, lambda: kernel.launch(noise, attended.keys, attended.values, attended.lengths, x_t, v_t)
+
+    def _several_denoised(self, attended: _Attended, *chunks: Tensor) -> tuple[Any, Callable[[], None]]:
+        """The same by operations."""
+        if self._by_ops is None:
+            self._by_ops = ExpertByOps.pack(self._expert, self._ops, self._dtype)
+        by, mixing = self._by_ops, self._expert.mixing(len(chunks[2]))
+        return (by, mixing), lambda: by.run(mixing, attended.keys, attended.values, attended.lengths, *chunks)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from turbopi.backends.base import Backend, LoadState, Sample, StageTimer, Trace
 from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.captured_rows import Turn
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.engine.graph import Graph, Mark
@@ -165,7 +166,8 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
     """
 
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32", WEIGHTS_ALONE)
-    _graphs: dict[int, _Graphs]  # type: ignore[assignment]
+    runs_batches: ClassVar[bool] = False
+    _graphs: dict[tuple[int, int], _Graphs]  # type: ignore[assignment]
 
     def load_weights(self, load: LoadState) -> None:
         self._joined: JoinedWeights | None = None
@@ -216,9 +218,8 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
 
     def answer(  # type: ignore[override]  # what is read of it is there
         self,
-        turn: object,
-        cameras: int,
-        tokens: np.ndarray,
+        turn: Turn,
+        tokens: Sequence[np.ndarray],
         state: np.ndarray,
         noise: np.ndarray,
         num_steps: int,
@@ -227,7 +228,7 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
         *,
         keep: bool = False,
     ) -> _Answered:
-        graphs = self._started(turn, cameras, tokens)
+        graphs = self._started(turn, tokens)
         timer.mark("prefix")
         most = graphs.decoding.ids.shape[1]
         if num_steps > most:
@@ -246,8 +247,8 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
         host, traces = observation.to("cpu"), []
         for row in range(host.batch_size):
             cameras, valid = host.image_mask[row], host.token_mask[row]
-            turn = self.see(list(host.images[row][cameras].numpy()), "lerobot", Past())
-            graphs = self._started(turn, int(cameras.sum()), host.tokens[row][valid].numpy())
+            turn = self.see([list(host.images[row][cameras].numpy())], "lerobot", [Past()])
+            graphs = self._started(turn, [host.tokens[row][valid].numpy()])
             decoding, logits = graphs.decoding, []
             images = self.config.vision.num_tokens * int(cameras.sum())
             for one in (*forced[: count - 1], None):
@@ -265,16 +266,16 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
         joined = {name: torch.cat([one[name] for one in traces], dim=1) for name in traces[0]}
         return joined | {"actions": self.sample(observation, noise, num_steps).actions}
 
-    def _started(self, turn: object, cameras: int, tokens: np.ndarray) -> _Graphs:
+    def _started(self, turn: Turn, tokens: Sequence[np.ndarray]) -> _Graphs:
         """Launch the prefix behind the images that `see` has begun on."""
-        graphs = self._graphs[cameras]
-        self._give_prompt(turn, graphs.inputs, tokens)
+        graphs: _Graphs = turn.graphs
+        self._give_prompts(turn, tokens)
         graphs.prefix.launch()
         return graphs
 
-    def _capture(self, cameras: int) -> _Graphs:  # type: ignore[override]
+    def _capture(self, cameras: int, batch: int) -> _Graphs:  # type: ignore[override]
         config = self.config
-        inputs = self._inputs(cameras)
+        inputs = self._inputs(cameras, batch)
         assert self.reader is not None
         decoding = self.model.allocate(inputs, config.max_decoding_steps, self.reader.ends)
         seen = self._seen(inputs)

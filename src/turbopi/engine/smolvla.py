@@ -4,8 +4,8 @@ portable kernel. What a CUDA graph captures: shapes are static, and nothing is c
 A prefix is compact: images, the prompt's tokens, the state, then padding; `length`, in device memory, says where that
 begins.
 
-Shapes: S places of a prefix with its padding, L layers of the expert, D its width, A action_dim, N steps, G key heads,
-K head_dim.
+Shapes: B observations, S places of a prefix with its padding, L layers of the expert, D its width, A action_dim, N
+steps, G key heads, K head_dim.
 """
 
 from collections.abc import Callable
@@ -23,6 +23,7 @@ from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, Visi
 from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
 from turbopi.kernels.portable.grouped import grouped_attention, rope_grouped, swiglu
+from turbopi.models.observation import Observation
 from turbopi.models.pi0.denoise import time_grid
 from turbopi.models.pi0.layers import rope_tables
 from turbopi.models.pi0.vision import EncoderLayer, normalize_images
@@ -132,7 +133,7 @@ class Prefix:
             for ids in (config.image_start, config.image_end)
         )
         scale = float(torch.tensor(config.text.width**0.5, dtype=dtype))  # rounded, as LeRobot's is
-        layers = [_joined(layer, dtype) for layer in model.vlm.layers]
+        layers = [joined(layer, dtype) for layer in model.vlm.layers]
         return cls(model, ops, layers, cross_k, cross_v, (start, end), scale)
 
     def places(self, cameras: int) -> int:
@@ -148,16 +149,38 @@ class Prefix:
         """[S, D] of image embeddings [V, T, D], tokens int64[max_prompt_tokens], whatever they are behind the prompt's
         end, and state float32[1, A]. length int64[1]: of the prefix, with the state.
         """
-        model, (start, end) = self.model, self.special
-        parts = [part for image in images.unbind(0) for part in (start, image * self.scale, end)]
-        prompt = model.vlm.embed_tokens(tokens) * model.config.text.width**0.5
-        of_state = model.state_proj(state).to(images.dtype)
-        return torch.cat((*parts, prompt.to(images.dtype), of_state)).index_copy_(0, length - 1, of_state)
+        x = self._all_places(images[None], tokens[None], state)[0]
+        return x.index_copy_(0, length - 1, x[-1:].clone())
 
-    def keys_values(self, x: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Each text layer's keys, rotated, and values, [layer, G, S, K], of embeddings [S, D]."""
-        text, ops = self.model.config.text, self.ops
-        positions = torch.arange(len(x), device=x.device)[None]
+    def embed_several(self, images: Tensor, observations: Observation) -> tuple[Tensor, Tensor]:
+        """[B * S, D] of image embeddings [B * V, T, D], and int64[B], how long each prefix is.
+
+        Cameras and places of the prompt may be missing: a prefix's valid places come first, in their order.
+        """
+        batch, cameras = observations.image_mask.shape
+        x = self._all_places(images.view(batch, cameras, *images.shape[1:]), observations.tokens, observations.state)
+        there = observations.image_mask.repeat_interleave(self.before_prompt(1), dim=1)
+        valid = torch.cat((there, observations.token_mask, there.new_ones(batch, 1)), dim=1)
+        lengths = valid.sum(1)
+        behind = lengths[:, None] + (~valid).cumsum(1)
+        first = torch.arange(batch, device=x.device)[:, None] * x.shape[1]
+        to = first + torch.where(valid, valid.cumsum(1), behind) - 1
+        x = x.flatten(0, 1)
+        return torch.empty_like(x).index_copy_(0, to.flatten(), x), lengths
+
+    def _all_places(self, images: Tensor, tokens: Tensor, state: Tensor) -> Tensor:
+        """[B, S, D] of [B, V, T, D], [B, max_prompt_tokens] and [B, A], the state's place last."""
+        model, batch = self.model, len(tokens)
+        start, end = (one.expand(batch, -1, -1) for one in self.special)
+        parts = [part for image in images.unbind(1) for part in (start, image * self.scale, end)]
+        prompt = model.vlm.embed_tokens(tokens) * model.config.text.width**0.5
+        of_state = model.state_proj(state)[:, None]
+        return torch.cat((*parts, prompt.to(images.dtype), of_state.to(images.dtype)), dim=1)
+
+    def keys_values(self, x: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        """Each text layer's keys, rotated, and values, [layer, G, B * S, K], of embeddings [B * S, D]."""
+        text, ops, batch = self.model.config.text, self.ops, len(lengths)
+        positions = torch.arange(len(x) // batch, device=x.device).repeat(batch)[None]
         cos, sin = (table[0, 0] for table in rope_tables(positions, text.head_dim, ROPE_BASE))
         k = x.new_empty(text.depth, text.num_kv_heads, len(x), text.head_dim)
         v, y, eps = torch.empty_like(k), None, text.rms_norm_eps
@@ -167,9 +190,7 @@ class Prefix:
             matrix = layer.qkv[-2 * text.num_kv_heads * text.head_dim :] if last else layer.qkv
             q = rope_grouped(ops.linear(normed, matrix), cos, sin, k[i], v[i])
             if not last:
-                y = ops.residual_linear(grouped_attention(q, k[i], v[i], length), layer.out)
-                x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps)
-                y = ops.residual_linear(swiglu(ops.linear(normed, layer.gate_up)), layer.down)
+                x, y = behind_attention(ops, layer, x, grouped_attention(q, k[i], v[i], lengths), eps)
         return k, v
 
     def of_expert(self, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,6 +209,14 @@ def _crossed(cached: Tensor, matrices: Tensor, own: list[bool]) -> Tensor:
     rows = torch.stack([cached[i] for i in across]).transpose(1, 2).reshape(len(across), places, groups * head_dim)
     made = iter((rows @ matrices).view(len(across), places, groups, head_dim).transpose(1, 2).unbind(0))
     return torch.stack([one if stays else next(made) for one, stays in zip(cached.unbind(0), own, strict=True)])
+
+
+def behind_attention(
+    ops: Ops, layer: GemmaLayer[Tensor], x: Tensor, attended: Tensor, eps: float
+) -> tuple[Tensor, Tensor]:
+    """The rest of a layer: the residual stream [rows, D], and what the next norm adds to it."""
+    x, normed = ops.residual_rms_norm(x, ops.residual_linear(attended, layer.out), None, layer.norm2, None, eps)
+    return x, ops.residual_linear(swiglu(ops.linear(normed, layer.gate_up)), layer.down)
 
 
 # -- the expert -------------------------------------------------------------------------------------------------------
@@ -234,7 +263,7 @@ class Expert:
         scale = torch.stack([norm.weight.float() for norm in (*norms, model.expert.norm)])
         table = torch.stack((scale, torch.zeros_like(scale), torch.ones_like(scale)), dim=1)[None]
         packed = PackedExpert.pack(
-            ExpertSizes.of(config), [_joined(layer, torch.bfloat16) for layer in layers], form=form(config)
+            ExpertSizes.of(config), [joined(layer, torch.bfloat16) for layer in layers], form=form(config)
         )
         return cls(packed, table, model)
 
@@ -246,10 +275,10 @@ class Expert:
         small = {f"{name}.{part}": getattr(one, part) for name, one in ends.items() for part in ("weight", "bias")}
         sizes: dict[str, Any] = {"cache_rows": cache_rows, "suffix": suffix, "device": device, **launch}
         return PortableDenoiser(
-            self.packed.config, self.packed, small, self.table, mixing=self._mixing(num_steps), **sizes
+            self.packed.config, self.packed, small, self.table, mixing=self.mixing(num_steps), **sizes
         )
 
-    def _mixing(self, num_steps: int) -> Mixing:
+    def mixing(self, num_steps: int) -> Mixing:
         """action_in_proj and the MLP behind it, whose first matrix also meets the time."""
         model = self.model
         into, first, last = model.action_in_proj, model.action_time_mlp_in, model.action_time_mlp_out
@@ -264,7 +293,7 @@ class Expert:
         )
 
 
-def _joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
+def joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
     """A layer across has keys and values of its own, made of the prefix's: their rows here are zeros, which are never
     read.
     """

@@ -171,16 +171,16 @@ def past_of(observation: Observation) -> Past:
 
 
 def remembering(observation: Observation, memory: MemoryConfig) -> PastObservation:
-    """An observation of one row, with a past of zeros, all of it valid."""
-    (_, cameras, *image), frames = observation.images.shape, memory.frames
+    """With a past of zeros, all of it valid."""
+    (batch, cameras, *image), frames = observation.images.shape, memory.frames
     there = observation.image_mask.new_ones
     parts: dict[str, Tensor] = {}
     if memory.visual:
-        parts["images"] = observation.images.new_zeros(1, cameras, frames - 1, *image)
-        parts["image_mask"] = there(1, cameras, frames - 1)
+        parts["images"] = observation.images.new_zeros(batch, cameras, frames - 1, *image)
+        parts["image_mask"] = there(batch, cameras, frames - 1)
     if memory.proprioceptive:
-        parts["states"] = observation.state.new_zeros(1, frames, memory.state_dim)
-        parts["state_mask"] = there(1, frames)
+        parts["states"] = observation.state.new_zeros(batch, frames, memory.state_dim)
+        parts["state_mask"] = there(batch, frames)
     return PastObservation(*(getattr(observation, name) for name in _TENSORS), past=Past(**parts))
 
 

@@ -96,7 +96,7 @@ class ChunkConditioning:
     @property
     def batch_modes(self) -> tuple[JoinMode, ...]:
         """Those of which several observations run together, on a backend that runs batches."""
-        return tuple(mode for mode in self.modes if FORMS[mode] != "noise")
+        return tuple(mode for mode in self.modes if FORMS[mode] in self._backend.batch_forms)
 
     def checked(
         self,

@@ -290,9 +290,9 @@ class UnifiedPolicy:
         `histories` for each row, and so does acting on subtasks; `subtasks` may give some. Errors name the row.
 
         If `runs_batches`, the backend computes 1, 2, 4, 8 or 16 observations together and splits other numbers; else
-        one by one, as with another solver than Euler's. Cameras and prompts may differ. Rows with fixed actions,
-        identity guidance or their own times run together with plain ones, rows guided by the true Jacobian with each
-        other.
+        one by one, as with another solver than Euler's. Cameras and prompts may differ. Where `batch_modes` has them,
+        rows with fixed actions, identity guidance or their own times run together with plain ones, rows guided by the
+        true Jacobian with each other; elsewhere they run one by one.
         Actions differ from those of `infer` by rounding (docs/performance.md).
         """
         rows = len(observations)

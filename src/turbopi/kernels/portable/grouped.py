@@ -1,6 +1,6 @@
 """Text layers whose query heads share keys and values in groups: RoPE, attention and SwiGLU between their matmuls.
 
-Shapes: S places, n query heads, g key heads, K head_dim, F hidden units.
+Shapes: B observations, S places of each, n query heads, g key heads, K head_dim, F hidden units.
 """
 
 import triton
@@ -64,54 +64,94 @@ def rope_grouped(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Te
 
 
 @triton.jit
+def _add_keys(queries, k, v, first, key, keys, seen, d, DIM: tl.constexpr, scale, acc, top, total):
+    """Some of `keys` keys and values into the running softmax: a row sees those before its `seen`."""
+    loaded = (key < keys)[:, None] & (d < DIM)[None, :]
+    at = (first + key)[:, None] * DIM + d[None, :]
+    logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
+    logits = tl.where(key[None, :] < seen[:, None], logits, -float("inf"))
+    new_top = tl.maximum(top, tl.max(logits, 1))
+    p = tl.exp2(logits - new_top[:, None])
+    shrink = tl.exp2(top - new_top)
+    values = tl.load(v + at, loaded, 0.0)
+    acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
+    return acc, new_top, total * shrink + tl.sum(p, 1)
+
+
+@triton.jit
 def _attention_kernel(
-    q, k, v, length, out, tokens, heads, scale,
+    q, k, v, own_k, own_v, lengths, out, tokens, places, heads, scale,
     GROUP: tl.constexpr, DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
-    PDL: tl.constexpr,
+    SUFFIX: tl.constexpr, OWN: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    """BLOCK_M rows of the queries of one key head."""
-    kv_head = tl.program_id(1)
+    """BLOCK_M rows of the queries of one key head of one observation."""
+    kv_head, observation = tl.program_id(1), tl.program_id(2)
+    block = kv_head * tl.num_programs(2) + observation
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
     n = tl.arange(0, BLOCK_N)
     d = tl.arange(0, BLOCK_D)
     wait_for_producer(PDL)
     launch_dependents(PDL)
-    end = tl.load(length).to(tl.int32)
+    end = tl.load(lengths + observation).to(tl.int32)
     token = m // GROUP
     seen = tl.where(token == end - 1, end, tl.maximum(end - 1, 1))
+    if SUFFIX:
+        seen = tl.zeros_like(token) + end
     inside = (token < tokens)[:, None] & (d < DIM)[None, :]
-    queries = tl.load(q + (kv_head * tokens * GROUP + m)[:, None] * DIM + d[None, :], inside, 0.0)
+    queries = tl.load(q + (block * tokens * GROUP + m)[:, None] * DIM + d[None, :], inside, 0.0)
     acc = tl.zeros((BLOCK_M, BLOCK_D), tl.float32)
     top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
     total = tl.zeros((BLOCK_M,), tl.float32)
     for start in range(0, end, BLOCK_N):
-        loaded = (start + n < end)[:, None] & (d < DIM)[None, :]
-        at = (kv_head * tokens + start + n)[:, None] * DIM + d[None, :]
-        logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
-        logits = tl.where((start + n)[None, :] < seen[:, None], logits, -float("inf"))
-        new_top = tl.maximum(top, tl.max(logits, 1))
-        p = tl.exp2(logits - new_top[:, None])
-        shrink = tl.exp2(top - new_top)
-        total = total * shrink + tl.sum(p, 1)
-        top = new_top
-        values = tl.load(v + at, loaded, 0.0)
-        acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
-    to = (token * heads + kv_head * GROUP + m % GROUP)[:, None] * DIM + d[None, :]
+        acc, top, total = _add_keys(queries, k, v, block * places, start + n, end, seen, d, DIM, scale, acc, top, total)
+    if OWN:
+        for start in range(0, tokens, BLOCK_N):
+            acc, top, total = _add_keys(
+                queries, own_k, own_v, block * tokens, start + n, tokens, token + 1, d, DIM, scale, acc, top, total
+            )
+    to = ((observation * tokens + token) * heads + kv_head * GROUP + m % GROUP)[:, None] * DIM + d[None, :]
     tl.store(out + to, (acc / total[:, None]).to(out.dtype.element_ty), inside)
 
 
-def grouped_attention(q: Tensor, k: Tensor, v: Tensor, length: Tensor) -> Tensor:
-    """Queries [g, S * n/g, K] over the first `length` (int64[1], on the device, at least 1) keys and values [g, S, K]
-    -> [S, n * K]. The last valid place sees all of them, the others all but that one. What lies beyond is never read.
+def grouped_attention(q: Tensor, k: Tensor, v: Tensor, lengths: Tensor) -> Tensor:
+    """Queries [g, B * S * n/g, K] of B observations over keys and values [g, B * S, K] -> [B * S, n * K].
+
+    lengths  int64[B], on the device, at least 1: how many of an observation's S places are valid, the first ones. The
+             last of them sees all of these, the others all but that one. What lies beyond is never read
     """
-    assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
-    kv_heads, tokens, dim = k.shape
-    group = q.shape[1] // tokens
-    out = q.new_empty(tokens, kv_heads * group * dim)
-    _attention_kernel[(triton.cdiv(tokens * group, ROWS), kv_heads)](
-        q, k, v, length, out, tokens, kv_heads * group, dim**-0.5 * LOG2_E, GROUP=group, DIM=dim,
-        BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=ROWS, BLOCK_N=KEYS, num_warps=4, num_stages=2,
-        **dependent_launch(q),
+    return _attention(q, (k, v), (k, v), lengths, k.shape[1] // len(lengths), suffix=False, own=False)
+
+
+def grouped_suffix_attention(
+    q: Tensor, k: Tensor, v: Tensor, lengths: Tensor, tokens: int, own: tuple[Tensor, Tensor] | None
+) -> Tensor:
+    """Queries [g, B * T * n/g, K] of B observations' `tokens`, T, behind their prefixes -> [B * T, n * K].
+
+    k, v  of the prefixes [g, B * S, K]: a token sees the first `lengths` (as above) of its observation's
+    own   keys and values of the tokens [g, B * T, K]: one sees those up to itself; None: none
+    """
+    return _attention(q, (k, v), own or (k, v), lengths, tokens, suffix=True, own=own is not None)
+
+
+def _attention(
+    q: Tensor,
+    prefix: tuple[Tensor, Tensor],
+    behind: tuple[Tensor, Tensor],
+    lengths: Tensor,
+    tokens: int,
+    *,
+    suffix: bool,
+    own: bool,
+) -> Tensor:
+    assert all(one.is_contiguous() for one in (q, *prefix, *behind, lengths)), "rows are read as they lie in memory"
+    kv_heads, rows, dim = q.shape
+    batch = len(lengths)
+    group = rows // (batch * tokens)
+    out = q.new_empty(batch * tokens, kv_heads * group * dim)
+    _attention_kernel[(triton.cdiv(tokens * group, ROWS), kv_heads, batch)](
+        q, *prefix, *behind, lengths, out, tokens, prefix[0].shape[1] // batch, kv_heads * group, dim**-0.5 * LOG2_E,
+        GROUP=group, DIM=dim, BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=ROWS, BLOCK_N=KEYS, SUFFIX=suffix, OWN=own,
+        num_warps=4, num_stages=2, **dependent_launch(q),
     )  # fmt: skip
     return out
 

@@ -366,8 +366,8 @@ class SmolVLAModel(nn.Module):
             scale = torch.tensor(self.config.text.width**0.5, dtype=its.dtype, device=its.device)
             for ids, images in ((self.config.image_start, its * scale), (self.config.image_end, None)):
                 if ids:
-                    special = torch.tensor(ids, device=its.device)
-                    parts.append(self.vlm.embed_tokens(special).expand(batch, -1, -1))
+                    special = torch.stack([self.vlm.embed_tokens.weight[one] for one in ids])
+                    parts.append(special.expand(batch, -1, -1))
                     valid.append(around[:, camera, None].expand(-1, len(ids)))
                 if images is not None:
                     parts.append(images)
