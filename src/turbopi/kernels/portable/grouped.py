@@ -148,10 +148,11 @@ def _attention(
     batch = len(lengths)
     group = rows // (batch * tokens)
     out = q.new_empty(batch * tokens, kv_heads * group * dim)
+    warps = 8 if suffix and not own else 4  # of 4, a thread spills on compute capability 11.0
     _attention_kernel[(triton.cdiv(tokens * group, ROWS), kv_heads, batch)](
         q, *prefix, *behind, lengths, out, tokens, prefix[0].shape[1] // batch, kv_heads * group, dim**-0.5 * LOG2_E,
         GROUP=group, DIM=dim, BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=ROWS, BLOCK_N=KEYS, SUFFIX=suffix, OWN=own,
-        num_warps=4, num_stages=2, **dependent_launch(q),
+        num_warps=warps, num_stages=2, **dependent_launch(q),
     )  # fmt: skip
     return out
 
