@@ -8,6 +8,7 @@ import torch
 from smolvla_golden import GoldenRuns, make_checkpoint, make_hub
 
 from turbopi import UnifiedPolicy
+from turbopi.backends.captured import CapturedBackend
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.models.observation import Observation
@@ -84,9 +85,11 @@ def test_a_conditioned_loop_and_a_batch_equal_the_references(checkpoints: dict[s
     assert all(relative(a["actions"], b["actions"]) <= 2e-5 for a, b in zip(*rows, strict=True))
 
 
+@pytest.mark.xfail(strict=True, reason="wrong on an H200, right on CPUs, compiled or not: CapturedBackend.runs_batches")
 def test_a_captured_batch_of_other_prompts_and_cameras_gives_lerobots_actions(
-    checkpoints: dict[str, Checkpoint],
+    checkpoints: dict[str, Checkpoint], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(CapturedBackend, "runs_batches", True)
     for name in ("base", "missing_camera"):
         policy, golden = UnifiedPolicy(checkpoints[name], precision="f32", backend="cuda_graph"), GoldenRuns(name)
         runs = [run % len(golden) for run in range(3)]
