@@ -132,11 +132,12 @@ def test_memory_is_held_against_what_the_weights_take(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr("psutil.virtual_memory", lambda: types.SimpleNamespace(available=available))
     monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: None)
-    row = checkups.check_memory(parameters)
+    weights = None if parameters is None else {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters}
+    row = checkups.check_memory(weights)
     assert row.level == level
     assert ("enough for bf16 alone" in row.found) == (available == 10e9)
     monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: 0.001)
-    assert checkups.check_memory(parameters).level == ("WARN" if parameters is None else "FAIL")
+    assert checkups.check_memory(weights).level == ("WARN" if parameters is None else "FAIL")
 
 
 def test_a_containers_memory_limit_is_read(tmp_path: Path) -> None:

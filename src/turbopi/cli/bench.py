@@ -122,15 +122,18 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
-def _backends(names: list[str], precisions: "list[Precision]", device: "torch.device") -> list[str]:
-    """The same with "auto" as what it stands for in each precision. Raises what `backends.check` raises for that."""
+def _backends(
+    names: list[str], precisions: "list[Precision]", device: "torch.device", checkpoint: "Checkpoint"
+) -> list[str]:
+    """The same with "auto" as what it stands for in each precision. Raises what `check_backend` raises for that."""
     from turbopi import backends
+    from turbopi.policy.kept_precision import check_backend
 
     found = []
     for name, precision in itertools.product(names, precisions):
         if name == "auto":
             chosen = backends.choose(device, precision)[0]
-            backends.check(chosen, device, precision)
+            check_backend(chosen, device, precision, checkpoint)
         found.append(chosen if name == "auto" else name)
     return list(dict.fromkeys(found))
 
@@ -271,7 +274,7 @@ def bench(
         resolved = registry.resolve_device(device)
         chosen = _names(own_precision(_names(backends)) if precisions is None else precisions)
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
-        names = _backends(_names(backends), tiers, resolved)
+        names = _backends(_names(backends), tiers, resolved, opened)
         robot = options.make_robot()
         axes["--image-size"] = image_size
         own = Denoising(1).changed(None, solver, typed_grid(time_grid), ConfigError)  # type: ignore[arg-type]
