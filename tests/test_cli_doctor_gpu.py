@@ -214,9 +214,8 @@ def test_where_bf16_does_not_fit_and_fp8_does_fp8_is_proposed(fake: Fake) -> Non
     assert bf16 is not None and fp8 is not None and fp8 < bf16
     fake((9, 0), (bf16 + fp8) / 2 + gpu_checkups.CONTEXT_GB)
     found = rows()
-    assert found["GPU 0 bf16"].fix == (
-        f"turbopi calibrate CHECKPOINT, then --precision fp8 ({fp8 + gpu_checkups.CONTEXT_GB:.1f} GB)"
-    )
+    size = f"({fp8 + gpu_checkups.CONTEXT_GB:.1f} GB)"
+    assert found["GPU 0 bf16"].fix == f"turbopi calibrate CHECKPOINT --precision fp8, then --precision fp8 {size}"
     assert found["GPU 0 fp8"].level == "OK"
 
 

@@ -436,10 +436,30 @@ def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text:
 
 
 @pytest.mark.parametrize(
+    ("options", "longest", "why"),
+    [
+        ({"execution": "rtc"}, 5, "chunks of 10 actions and an execution horizon of 5 at most 5 control steps fit"),
+        ({"execution": "rtc", "execution_horizon": 8}, 2, "chunks of 10 .* horizon of 8 at most 2 control steps fit"),
+        ({"execution": "rtc", "execution_horizon": 2}, 5, "an execution horizon of 2 at most 5 control steps fit"),
+        ({}, 5, "at most 5 control steps fit"),  # of named sessions
+        ({"execution": "rtc_trained"}, 2, "this checkpoint was trained with delays up to 2"),
+    ],
+)
+def test_a_fixed_delay_that_would_be_cut_in_every_call_is_refused(
+    options: dict[str, Any], longest: int, why: str
+) -> None:
+    policy = Joins()
+    policy.metadata["action_horizon"] = H
+    real_time(policy, **options, control_hz=50, delay_steps=longest)
+    with pytest.raises(ConfigError, match=f"^delay_steps={longest + 1} was asked for, but .*{why}"):
+        real_time(policy, **options, control_hz=50, delay_steps=longest + 1)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({}, ("by rtc:", "50 actions a second (--control-hz), 5 of 10 before", "delay is measured here")),
-        ({"execution": "rtc_trained", "delay_steps": 3}, ("by rtc_trained:", "the delay is 3 control steps.")),
+        ({"execution": "rtc_trained", "delay_steps": 2}, ("by rtc_trained:", "the delay is 2 control steps.")),
         ({"execution_horizon": 6, "control_hz": 12.5}, ("12.5 actions a second", "6 of 10 before")),
     ],
 )

@@ -52,7 +52,7 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
 
 def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "Checkpoint") -> None:
     """Raise ConfigError for options of a server that the policy won't be able to follow."""
-    if server.execution is None and server.execution_horizon is None and server.max_batch is None:
+    if (server.execution, server.execution_horizon, server.delay_steps, server.max_batch) == (None,) * 4:
         return
     from turbopi.serve.calls import largest_batch
     from turbopi.serve.real_time import check_execution

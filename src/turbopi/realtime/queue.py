@@ -458,6 +458,11 @@ def default_execution_horizon(horizon: int) -> int:
     return max(1, horizon // 2)
 
 
+def longest_delay(horizon: int, s: int) -> int:
+    """The most control steps d from an observation to its chunk: d ≤ H − s, and as s is d at least, d ≤ H / 2."""
+    return min(horizon - s, horizon // 2)
+
+
 def _horizon(s: int) -> int:
     if isinstance(s, bool) or not isinstance(s, int | np.integer) or s < 1:
         raise ConfigError(f"the execution horizon is {s!r}; it should be a whole number of actions, from 1 to H")
