@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.realtime import RealTimeExecutor
+from turbopi.realtime import ChunkQueue, RealTimeExecutor
 from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
 from turbopi.realtime.messages import KEYS, message, read_message
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
@@ -414,6 +414,25 @@ def test_what_the_server_cannot_know_or_join_is_refused(
         call(server, policy, {"place": 0, **{f"turbopi/{key}": value for key, value in first.items()}})
     with pytest.raises(ObservationError, match=text):
         call(server, policy, {"place": 0, **{f"turbopi/{key}": value for key, value in second.items()}})
+
+
+@pytest.mark.parametrize("mode", sorted({*get_args(JoinMode)} - {"rtc", "rtc_identity"}))
+@pytest.mark.parametrize("option", [{"schedule": "linear"}, {"max_guidance_weight": 1.0}], ids=repr)
+def test_options_of_guidance_are_refused_by_modes_that_do_not_guide(mode: Any, option: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"turbopi/" + name: value for name, value in option.items()}
+    why = f"turbopi/{next(iter(option))} say how rtc and rtc_identity guide; {mode} doesn't guide"
+    for execution, requested in (
+        (None, {"mode": mode, "previous": LEFT, "delay": 1}),
+        (None, {"mode": mode, "session": "arm", "step": 0}),
+        (mode, {"step": 0}),
+    ):
+        server, *_ = real_time(Joins([mode]), execution=execution, control_hz=50)
+        message = {"place": 0, **{f"turbopi/{key}": value for key, value in requested.items()}}
+        server.plan(message, "c")
+        with pytest.raises(ObservationError, match=why):
+            server.plan(message | options, "another")
+    with pytest.raises(ConfigError, match=f"{next(iter(option))} say how"):
+        ChunkQueue(mode, **option)
 
 
 def test_a_server_joins_by_the_ways_there_are() -> None:

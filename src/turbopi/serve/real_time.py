@@ -27,7 +27,7 @@ from turbopi.realtime.messages import (
     read_message,
 )
 from turbopi.realtime.queue import default_execution_horizon, longest_delay
-from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk, refuses_guidance
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import ConfigError, ObservationError
@@ -172,6 +172,9 @@ class RealTime:
         mode = requested.mode or self._options.execution
         if mode is not None and mode not in self._modes:
             raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
+        guidance = {PREFIX + name: value for name, value in (requested.guidance or {}).items()}
+        if mode is not None and (why := refuses_guidance(mode, guidance)) is not None:
+            raise ObservationError(why)
         if requested.session is None and (requested.previous is not None or requested.model_actions):
             if not self._remembers and (requested.step is not None or requested.reset):
                 raise ObservationError(
