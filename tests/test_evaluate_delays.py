@@ -11,6 +11,7 @@ import pytest
 from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
+from turbopi.cli.evaluate import _delays_table
 from turbopi.config import RealTime
 from turbopi.evaluate.checks import check_delay
 from turbopi.evaluate.delays import Cell, document, make_cells, notes, write_delays
@@ -170,6 +171,11 @@ def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
     ]
     assert notes(reported.cells, None)[0] in text and not notes(reported.cells[:2], None)
     assert all(cell.folder in text for cell in cells)
+    table = _delays_table("chase under delay", reported.cells)  # its rows are told apart by the first column alone
+    assert table.title == "chase under delay, horizon 5"
+    headings = [str(column.header) for column in table.columns]
+    assert not {"delay", "horizon"} & {*headings} and {"success \\[95 %]", "stood still"} <= {*headings}
+    assert list(table.columns[0].cells) == ["sync, delay 0", "sync, delay 4", "async, delay 0", "async, delay 4"]
     assert (tmp_path / "delays.png").exists() and (tmp_path / "seams.png").exists()
 
 

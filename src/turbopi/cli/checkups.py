@@ -155,7 +155,9 @@ def check_memory(weights: Mapping[str, float] | None) -> Row:
 
 
 def _size(gigabytes: float) -> str:
-    return f"{gigabytes:.1f} GB" if gigabytes >= 0.1 else f"{1e3 * gigabytes:.0f} MB"
+    if gigabytes >= 0.1:
+        return f"{gigabytes:.1f} GB"
+    return f"{1e3 * gigabytes:.0f} MB" if gigabytes >= 0.01 else f"{1e6 * gigabytes:,.0f} kB"
 
 
 def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:
@@ -208,19 +210,15 @@ def own_precision(opened: Any) -> Any:
 def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
     """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning."""
     from turbopi.config import ModelConfig
-    from turbopi.preprocess.tokenizer import load_tokenizer
+    from turbopi.preprocess.tokenizer import load_tokenizer, tokenizer_of
 
-    vocab_size = ModelConfig().vocab_size if checkpoint is None else checkpoint.config.model.vocab_size
     try:
-        loaded = load_tokenizer(
-            given,
-            vocab_size=vocab_size,
-            checkpoint_dir=None if checkpoint is None else checkpoint.path,
-            named=None if checkpoint is None else checkpoint.named_tokenizer,
-            candidates=() if checkpoint is None else checkpoint.tokenizer_candidates,
-        )
+        if checkpoint is None:
+            loaded = load_tokenizer(given, vocab_size=ModelConfig().vocab_size)
+        else:
+            loaded = tokenizer_of(checkpoint, given)
     except TurboPiError as error:
-        first, *rest = str(error).splitlines()
+        first, *rest = as_typed(str(error)).splitlines()
         fix = " && ".join(line.strip() for line in rest if "curl" in line or "mkdir" in line) or "see the message"
         if checkpoint is None and given is None:
             return Row("WARN", "tokenizer", "PaliGemma's isn't here; a real checkpoint needs it", fix)
