@@ -95,6 +95,11 @@ def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
     assert rows["tokenizer"]["found"] == str(TINY_TOKENIZER)
 
 
+def test_a_checkpoint_is_given_as_to_other_commands_or_as_an_option(tmp_path: Path) -> None:
+    assert doctor(tmp_path)[1]["checkpoint"] == doctor("--checkpoint", tmp_path)[1]["checkpoint"]
+    assert "each name a checkpoint" in refusal(turbopi("doctor", tmp_path, "--checkpoint", tmp_path))
+
+
 def test_a_checkpoint_that_cannot_be_opened_fails(tmp_path: Path) -> None:
     code, rows = doctor("--checkpoint", tmp_path / "nothing")
     assert code == 1

@@ -140,7 +140,7 @@ def test_a_run_under_delay_is_another_run_and_an_old_one_is_still_continued(tmp_
     assert load_results(tmp_path).episodes[0, 0].motion is None
     continued = run(tmp_path, SeekingPolicy(), states=(0, 1))
     assert continued.episodes.keys() == {(0, 0), (0, 1)} and results.episodes.keys() == {(0, 0)}
-    with pytest.raises(ConfigError, match="delay"):
+    with pytest.raises(ConfigError, match=r"protocol\.delay = 0, but this one has 2: give another --out"):
         run(tmp_path, SeekingPolicy(), states=(0,), execution="async", delay=2)
 
 

@@ -26,6 +26,9 @@ STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
     ),
 )
 def doctor(
+    folder: Annotated[
+        str | None, typer.Argument(metavar="CHECKPOINT", help="As --checkpoint.", show_default=False)
+    ] = None,
     checkpoint: Annotated[
         str | None, typer.Option("--checkpoint", metavar="CHECKPOINT", help="Check this one, and its needs, too.")
     ] = None,
@@ -58,6 +61,10 @@ def doctor(
     output = Output(as_json)
     from turbopi.cli.checkups import examine, open_for_check, own_precision, system
 
+    if folder is not None:
+        if checkpoint is not None:
+            raise ConfigError(f"{folder} and --checkpoint {checkpoint} each name a checkpoint: give one of them")
+        checkpoint = folder
     if force and not qualify:
         raise ConfigError("--force goes with --qualify")
     verdict = run_qualification(checkpoint, config, device, precision, force, output) if qualify else {}

@@ -87,6 +87,12 @@ def evaluate_command(
     result isn't complete.
     """
     output = Output(as_json)
+    from turbopi.evaluate.controls import Controlled, check_control
+    from turbopi.sim import SIMULATORS
+
+    if simulator not in SIMULATORS and Path(simulator).is_dir():
+        raise ConfigError(f"{simulator} is a folder, but the simulator comes first: turbopi eval SIMULATOR CHECKPOINT")
+    check_control(control)
     options.check_real_time()
     remote = host is not None or port is not None
     if remote:
@@ -117,8 +123,6 @@ def evaluate_command(
         for cell in cells:
             check_way(source, cell.protocol(protocol))
         if control is not None:
-            from turbopi.evaluate.controls import Controlled
-
             instructions = [job.task.instruction for job in jobs]
             source = Controlled(source, control, instructions, chosen.image_keys)  # type: ignore[arg-type]
         folder = options.out or DEFAULT_OUT / _folder_name(protocol.suite, source.label, source.about)
