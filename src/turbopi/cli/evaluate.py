@@ -19,6 +19,7 @@ from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.tables import tell_apart
+from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document
 
@@ -306,7 +307,7 @@ def _reported(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
 
 
 def _line(episode: "Episode") -> str:
-    why = f" ({episode.message.strip().splitlines()[-1]})" if episode.message else ""
+    why = f" ({as_typed(episode.message.strip().splitlines()[-1])})" if episode.message else ""
     return (
         f"task {episode.task}, initial state {episode.initial_state}: {episode.status} after {episode.steps} steps, "
         f"{episode.seconds:.0f} s{why}"
