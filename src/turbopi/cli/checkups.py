@@ -157,7 +157,7 @@ def check_memory(weights: Mapping[str, float] | None) -> Row:
 def _size(gigabytes: float) -> str:
     if gigabytes >= 0.1:
         return f"{gigabytes:.1f} GB"
-    return f"{1e3 * gigabytes:.0f} MB" if gigabytes >= 0.01 else f"{1e6 * gigabytes:,.0f} kB"
+    return f"{1e3 * gigabytes:.0f} MB" if gigabytes >= 1e-3 else f"{1e6 * gigabytes:,.0f} kB"
 
 
 def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:
