@@ -1,6 +1,6 @@
 """An SO-101 of LeRobot's that asks a Turbo-Pi server, with the keys that LeRobot's robot has.
 
-    turbopi serve CHECKPOINT --robot so101_follower &                       # a LeRobot checkpoint (pi05 or pi0)
+    turbopi serve CHECKPOINT --robot so101_follower &                       # a LeRobot checkpoint
     python examples/lerobot_so101.py --arm /dev/ttyACM0 --camera front=0 --task "put the cube into the box"
 
 Without an arm and a checkpoint, to try it:

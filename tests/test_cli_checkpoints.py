@@ -125,7 +125,7 @@ def test_inspect_refuses_a_wrong_configuration_after_the_rest(tmp_path: Path) ->
 def test_inspect_says_where_the_tokenizer_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
     folder = GOLDEN / "pi05" / "torch"
-    assert "openpi's cache: `turbopi doctor` says where to get it" in text_of(turbopi("inspect", folder).stdout)
+    assert "not found: `turbopi doctor --checkpoint` says where to get it" in text_of(turbopi("inspect", folder).stdout)
     (tmp_path / "big_vision").mkdir()
     (tmp_path / "big_vision" / "paligemma_tokenizer.model").touch()
     assert "none in the folder; openpi's: " in text_of(turbopi("inspect", folder).stdout)

@@ -95,6 +95,11 @@ def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
     assert rows["tokenizer"]["found"] == str(TINY_TOKENIZER)
 
 
+def test_a_checkpoint_is_given_as_to_other_commands_or_as_an_option(tmp_path: Path) -> None:
+    assert doctor(tmp_path)[1]["checkpoint"] == doctor("--checkpoint", tmp_path)[1]["checkpoint"]
+    assert "each name a checkpoint" in refusal(turbopi("doctor", tmp_path, "--checkpoint", tmp_path))
+
+
 def test_a_checkpoint_that_cannot_be_opened_fails(tmp_path: Path) -> None:
     code, rows = doctor("--checkpoint", tmp_path / "nothing")
     assert code == 1
@@ -132,11 +137,12 @@ def test_memory_is_held_against_what_the_weights_take(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr("psutil.virtual_memory", lambda: types.SimpleNamespace(available=available))
     monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: None)
-    row = checkups.check_memory(parameters)
+    weights = None if parameters is None else {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters}
+    row = checkups.check_memory(weights)
     assert row.level == level
     assert ("enough for bf16 alone" in row.found) == (available == 10e9)
     monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: 0.001)
-    assert checkups.check_memory(parameters).level == ("WARN" if parameters is None else "FAIL")
+    assert checkups.check_memory(weights).level == ("WARN" if parameters is None else "FAIL")
 
 
 def test_a_containers_memory_limit_is_read(tmp_path: Path) -> None:

@@ -182,6 +182,13 @@ def test_doctor_says_what_to_do_about_a_fault(fake: Fake, monkeypatch: pytest.Mo
     assert refusal(turbopi("doctor", "--force")) == "--force goes with --qualify"
 
 
+def test_qualifying_without_a_gpu_says_that_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    needs = "--qualify tries backend fused on an NVIDIA GPU, and"
+    assert refusal(turbopi("doctor", "--qualify")) == f"{needs} there is none here; `turbopi doctor` says why"
+    assert refusal(turbopi("doctor", "--qualify", "--device", "cpu")) == f"{needs} --device cpu isn't one"
+
+
 def test_a_known_gpu_is_said_to_be_one(fake: Fake) -> None:
     fake((9, 0))
     assert rows()["GPU 0 known"].level == "OK"
@@ -207,9 +214,8 @@ def test_where_bf16_does_not_fit_and_fp8_does_fp8_is_proposed(fake: Fake) -> Non
     assert bf16 is not None and fp8 is not None and fp8 < bf16
     fake((9, 0), (bf16 + fp8) / 2 + gpu_checkups.CONTEXT_GB)
     found = rows()
-    assert found["GPU 0 bf16"].fix == (
-        f"turbopi calibrate CHECKPOINT, then --precision fp8 ({fp8 + gpu_checkups.CONTEXT_GB:.1f} GB)"
-    )
+    size = f"({fp8 + gpu_checkups.CONTEXT_GB:.1f} GB)"
+    assert found["GPU 0 bf16"].fix == f"turbopi calibrate CHECKPOINT --precision fp8, then --precision fp8 {size}"
     assert found["GPU 0 fp8"].level == "OK"
 
 

@@ -158,6 +158,11 @@ CANNOT = "was asked for, which this policy can't: it offers"
             [*RTC, "--execution-horizon", "11"],
             "--execution-horizon 11 was asked for, but this policy's chunks have 10 ",
         ),
+        (
+            [*RTC, "--delay-steps", "3", "--execution-horizon", "8"],
+            "--delay-steps 3 was asked for, but with chunks of 10 actions and an execution horizon of 8 at most 2 "
+            "control steps fit: give at most that, another --execution-horizon, or a lower control rate",
+        ),
     ],
 )
 def test_what_the_policy_cannot_do_is_refused_before_its_weights_are_loaded(

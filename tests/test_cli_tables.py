@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from turbopi.cli.framework import Output
-from turbopi.cli.tables import fitted
+from turbopi.cli.framework import Output, new_console
+from turbopi.cli.tables import fitted, tell_apart
 from turbopi.robots import create_robot
 
 pytestmark = pytest.mark.usefixtures("two_layers", "unseen_plots")
@@ -82,6 +82,23 @@ def test_a_wide_table_comes_in_parts_with_its_sections_and_styles() -> None:
     assert all(part.columns[0].header == "row" for part in parts)
     assert all(part.rows[0].style == "bold" and part.rows[0].end_section for part in parts)
     assert sum(len(part.columns) - 1 for part in parts) == 12
+
+
+def test_rows_are_named_by_what_tells_them_apart() -> None:
+    rows = [["a bf16", "2 cam", "", "H=10"], ["a f32", "2 cam", "B=2", "H=10"]]
+    assert tell_apart(rows) == (["a bf16", "a f32, B=2"], "2 cam, H=10")
+    assert tell_apart(rows[:1]) == (["a bf16"], "2 cam, H=10")
+    assert tell_apart([["a", "x"], ["a", "x"]]) == (["a", "a"], "x") and tell_apart([]) == ([], "")
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 80), ("150", 150)])
+def test_a_pipe_is_eighty_columns_wide_unless_told_otherwise(
+    columns: str | None, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    assert new_console(stderr=False).width == width
 
 
 TINY = ("--random-weights", "pi05_tiny")

@@ -191,8 +191,8 @@ def test_without_a_gpu_it_says_so() -> None:
     if torch.cuda.is_available():
         pytest.skip("there is one")
     said = refusal(turbopi("tune"))
-    needed = "--dry-run needs it, too: which tiles there are depends on the GPU"
-    assert said == f"tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why. {needed}"
+    needs = "tiles are measured, and for --dry-run listed, on an NVIDIA GPU"
+    assert said == f"{needs}, and there is none here; `turbopi doctor` says why"
 
 
 def test_a_gpu_that_fused_cannot_use_comes_with_its_reason(fake: FakeGpu, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,15 +11,19 @@ import pytest
 from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
+from turbopi.cli.evaluate import _delays_table
+from turbopi.config import RealTime
 from turbopi.evaluate.checks import check_delay
-from turbopi.evaluate.delays import Cell, document, make_cells, write_delays
+from turbopi.evaluate.delays import Cell, document, make_cells, notes, write_delays
 from turbopi.evaluate.episode import Execution, run_episode
 from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import protocol_json
 from turbopi.evaluate.sources import LocalPolicy
+from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.realtime import WAYS
+from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.sim import create
 from turbopi.sim.base import Task
 from turbopi.support.errors import ConfigError
@@ -89,6 +93,14 @@ def test_without_a_delay_every_way_is_openpis_loop_step_by_step(way: str) -> Non
     assert carried_out(way, 1) != openpis_loop(4, 20)  # a delay that is ignored would be seen
 
 
+@pytest.mark.parametrize("way", ["rtc", "rtc_identity", "rtc_trained", "paint"])
+def test_ways_that_are_plain_without_a_delay_make_an_ordinary_call_then(way: Any) -> None:
+    left_over, options = np.zeros((8, 32), np.float32), RealTime(trained_max_delay=2)
+    chunk = RunningChunk(left_over, 0, 2, way).completed(10, 32, relative=False, options=options)
+    is_plain = chunk.conditioning(left_over, 10, 10, "accumulated") == Conditioning()
+    assert is_plain == WAYS[way].plain_without_delay
+
+
 @pytest.mark.parametrize("way", ["async", "rtc", "rtc_identity", "rtc_trained"])
 def test_a_chunk_takes_over_exactly_so_many_steps_after_its_observation(way: str) -> None:
     first = [0, 1, 2, 3, 4, 5]  # asked again at step 4, the answer is there at step 6 and entered at its row 2
@@ -128,7 +140,7 @@ def test_a_run_under_delay_is_another_run_and_an_old_one_is_still_continued(tmp_
     assert load_results(tmp_path).episodes[0, 0].motion is None
     continued = run(tmp_path, SeekingPolicy(), states=(0, 1))
     assert continued.episodes.keys() == {(0, 0), (0, 1)} and results.episodes.keys() == {(0, 0)}
-    with pytest.raises(ConfigError, match="delay"):
+    with pytest.raises(ConfigError, match=r"protocol\.delay = 0, but this one has 2: give another --out"):
         run(tmp_path, SeekingPolicy(), states=(0,), execution="async", delay=2)
 
 
@@ -154,7 +166,16 @@ def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
     assert delayed.standing is not None and delayed.standing > 0
     assert json.loads((tmp_path / "delays.json").read_text())["cells"][1]["success"]["successes"] == 2
     text = page.read_text()
+    assert notes(reported.cells, None) == [
+        "the same with a delay of 0: sync, async; these are ordinary calls, which need nothing of the chunk before"
+    ]
+    assert notes(reported.cells, None)[0] in text and not notes(reported.cells[:2], None)
     assert all(cell.folder in text for cell in cells)
+    table = _delays_table("chase under delay", reported.cells)  # its rows are told apart by the first column alone
+    assert table.title == "chase under delay, horizon 5"
+    headings = [str(column.header) for column in table.columns]
+    assert not {"delay", "horizon"} & {*headings} and {"success [95 %]", "stood still"} <= {*headings}
+    assert list(table.columns[0].cells) == ["sync, delay 0", "sync, delay 4", "async, delay 0", "async, delay 4"]
     assert (tmp_path / "delays.png").exists() and (tmp_path / "seams.png").exists()
 
 

@@ -461,7 +461,7 @@ def test_a_way_that_the_policy_is_too_slow_for_ends_the_run_with_the_reason(tmp_
 def test_a_protocol_in_real_time_has_no_simulated_delay_and_needs_a_robot_that_can_stand() -> None:
     with pytest.raises(ConfigError, match="a delay of 2 steps can't be simulated in real time"):
         Protocol("chase", "chase_post", delay=2, control_hz=20.0)
-    with pytest.raises(ConfigError, match=r"control_hz is 0.0; it should be above 0, at most 10000"):
+    with pytest.raises(ConfigError, match=r"control_hz=0.0 should be above 0, at most 10000"):
         Protocol("chase", "chase_post", control_hz=0.0)
 
     class Restless:
@@ -480,8 +480,8 @@ def test_a_protocol_in_real_time_has_no_simulated_delay_and_needs_a_robot_that_c
         ("--real-time --workers 2", "--real-time runs one episode at a time"),
         ("--real-time --smooth-videos", "draws at every control step"),
         ("--control-hz 10", "--control-hz is the rate of --real-time"),
-        ("--real-time --control-hz -1", "control_hz is -1.0; it should be above 0"),
-        ("--real-time --control-hz 0", "control_hz is 0.0; it should be above 0"),
+        ("--real-time --control-hz -1", "--control-hz -1.0 should be above 0"),
+        ("--real-time --control-hz 0", "--control-hz 0.0 should be above 0"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options: str, why: str, tmp_path: Path) -> None:

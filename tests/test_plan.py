@@ -364,9 +364,19 @@ def test_no_command_is_recommended_where_auto_would_not_run_it() -> None:
     assert "turbopi serve CHECKPOINT --backend fused --precision fp8" in chosen, "auto takes it for FP8"
 
 
+@pytest.mark.parametrize("precision", ["bf16", "fp8", "int8"])
+def test_a_command_with_a_calibrated_precision_comes_behind_its_calibration(precision: str) -> None:
+    shown = turbopi(*ASK, "--gpu", "h200", "--precision", precision).stdout.splitlines()
+    commands = [line.partition("turbopi ")[2] for line in shown if line.startswith("run")]
+    calibrate = f"calibrate CHECKPOINT --precision {precision} --observations RECORDING"
+    serve = f"serve CHECKPOINT --backend fused --precision {precision} --max-batch "
+    assert commands[:-1] == ([] if precision == "bf16" else [calibrate]) and commands[-1].startswith(serve)
+
+
 def test_a_plan_without_times_of_batches_says_so() -> None:
     reported = (
-        "Batches of such chunks weren't measured there: `turbopi bench --horizons 10 --batch 1,2,4,8`, then --times"
+        "Batches of such chunks weren't measured there. Measure them with `turbopi bench CHECKPOINT --backends fused "
+        "--precisions int8 --horizons 10 --batch 1,2,4,8 --report DIR`, then give --times DIR/results.json"
     )
     ask = ["--hz", "20", "--horizon", "10", "--gpu", "h200", "--precision", "int8"]
     assert reported in turbopi("plan", "--robots", "12", *ask).stdout.splitlines()

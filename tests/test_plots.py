@@ -19,7 +19,7 @@ from turbopi.policy.ranges import DrawnRange, TrainingRange
 from turbopi.policy.shipped import SMALL_POLICY
 from turbopi.robots.labels import Label
 from turbopi.support.action_groups import action_groups
-from turbopi.support.plots import SOLVED, Row, plot_chunks
+from turbopi.support.plots import SOLVED, Row, plot_chunks, write_figure
 
 RANDOM = np.random.default_rng(0)
 
@@ -86,6 +86,12 @@ def test_a_value_beyond_the_limits_is_shown(drawn: list[Figure], tmp_path: Path)
     chunk[3, 6] = 4.0
     (axes,) = axes_of(drawn, "libero", [chunk], tmp_path)
     assert axes[2].get_ylim()[1] > 4 and axes[1].get_ylim()[1] < 1.2
+
+
+def test_a_character_that_no_font_has_warns_nobody(tmp_path: Path) -> None:
+    figure = Figure()
+    figure.suptitle("wave at the \N{ROBOT FACE}")
+    write_figure(tmp_path / "one.png", figure)  # a warning would be an error here
 
 
 def test_what_is_not_finite_leaves_an_axis(drawn: list[Figure], tmp_path: Path) -> None:

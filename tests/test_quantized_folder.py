@@ -148,10 +148,27 @@ def test_what_such_a_folder_cannot_do_is_refused_by_name(tiny: Path, tmp_path: P
 
 
 def test_the_policy_takes_the_folders_precision_unless_another_is_given(tiny: Path) -> None:
-    with pytest.raises(BackendUnavailable, match="keeps its weights in int8, and backend 'fused' can't run on cpu"):
+    with pytest.raises(BackendUnavailable, match=r"can't run on cpu.*emulated_int8'.*keeps its weights in int8 alone"):
         UnifiedPolicy(tiny / "int8", device="cpu")
     with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
         UnifiedPolicy(tiny / "int8", device="cpu", precision="f32")
+
+
+@pytest.mark.parametrize("command", ["serve --port 0", "bench", "eval chase", "verify"])
+def test_every_command_says_that_the_folder_has_one_precision(tiny: Path, command: str) -> None:
+    refused = turbopi(*command.split(), tiny / "int8", "--device", "cpu")
+    assert refused.exit_code == 2 and "keeps its weights in int8" in refused.stderr
+    assert "take the checkpoint that it was made from" in refused.stderr
+
+
+def test_doctor_speaks_of_the_precision_that_the_folder_keeps(tiny: Path) -> None:
+    document = json.loads(turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--json").stdout)
+    rows = {row["name"]: row for row in document["checks"]}
+    assert document["precision"] == "fp8" and document["auto"] == "fused" and not document["auto_runs"]
+    assert rows["memory"]["found"].endswith("this checkpoint takes 9 MB in fp8")
+    assert rows["precision"]["level"] == "FAIL" and "fp8 needs an NVIDIA GPU" in rows["precision"]["found"]
+    given = turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--precision", "bf16", "--json")
+    assert json.loads(given.stdout)["precision"] == "bf16"
 
 
 def test_another_calibration_is_refused(tiny: Path, tmp_path: Path) -> None:

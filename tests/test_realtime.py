@@ -696,6 +696,7 @@ def test_a_way_that_the_policy_does_not_offer_is_refused(execution: str) -> None
         ({"delay_window": 2.5}, "window is 2.5; it should be a whole number of delays, from 1"),
         ({"old_weight": None}, "old_weight is None; it should be a number from 0 to 1"),
         ({"schedule": "steep"}, "schedule is 'steep'; expected one of"),
+        ({"schedule": "ones"}, "schedule say how rtc and rtc_identity guide; async doesn't guide: leave them out"),
         ({"max_guidance_weight": float("nan")}, "max_guidance_weight is nan; expected 0 to 1e6"),
         ({"infer_arguments": 5}, "infer_arguments is 5; it should be a mapping"),
         ({"execution": ["rtc"]}, r"execution=\['rtc'\] is no way to run; choose one of"),

@@ -27,10 +27,10 @@ from turbopi.replay.judge import judge
 from turbopi.replay.keys import KeyMap
 from turbopi.replay.opening import open_dataset
 from turbopi.replay.page import DOCUMENT, PAGE
-from turbopi.replay.report import CAMERAS, Report
+from turbopi.replay.report import CAMERAS, Report, Second
 from turbopi.replay.run import OF_AN_EPISODE, Replay, Replayed, Settings, affordable, select, variations_of
 from turbopi.robots import robot_from_dict
-from turbopi.support.errors import ConfigError, ObservationError
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 from turbopi.support.reading import read_document
 
 
@@ -219,6 +219,76 @@ def test_batches_change_nothing(
     together = replayed(path)
     assert sizes == [6]
     assert together.policies[0].joints == alone.policies[0].joints and together.worst == alone.worst
+
+
+def breaking(policy: UnifiedPolicy, seeds: set[int], monkeypatch: pytest.MonkeyPatch, *, together: bool) -> None:
+    """A policy whose answers with the noise of these seeds are no chunks."""
+    whole = policy.infer
+
+    def infer(observation: Mapping[str, Any], *, seed: int) -> dict[str, Any]:
+        if seed in seeds:
+            raise ActionError("it has a cut character")
+        return whole(observation, seed=seed)
+
+    def infer_batch(observations: Sequence[Mapping[str, Any]], *, seed: Sequence[int]) -> list[dict[str, Any]]:
+        return [infer(one, seed=own) for one, own in zip(observations, seed, strict=True)]
+
+    monkeypatch.setattr(UnifiedPolicy, "runs_batches", together)
+    monkeypatch.setattr(policy, "infer", infer)
+    monkeypatch.setattr(policy, "infer_batch", infer_batch)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_broken_answers_are_counted_and_the_others_judged(
+    policy: UnifiedPolicy,
+    replayed: Callable[..., ReplayDocument],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    together: bool,
+) -> None:
+    path = write_npz(tmp_path / "data")
+    sound = replayed(path)
+    breaking(policy, {2}, monkeypatch, together=together)
+    document = replayed(path, variations=1)
+    (broken,) = document.policies[0].broken
+    assert (broken.episode, broken.step, broken.why) == ("episode_2", 0, "it has a cut character")
+    assert not document.verdict.passed and document.verdict.hints == [
+        "1 of 6 answers are no chunk that a robot may be given, and are left out of the errors: there the robot would "
+        "hold. The first: episode episode_2, step 0: it has a cut character"
+    ]
+    errors = {one.episode: one.relative for one in sound.worst}
+    assert {one.episode: one.relative for one in document.worst}.items() >= {
+        episode: error for episode, error in errors.items() if episode != "episode_2"
+    }.items()
+    assert document.policies[0].changed[0].moments == 3, "of four, one of them broken"
+    breaking(policy, set(range(6)), monkeypatch, together=together)
+    with pytest.raises(
+        ActionError, match=r"none of the policy's 6 answers .* The first: episode episode_0, step 0: it"
+    ):
+        replayed(path)
+
+
+def test_two_policies_are_compared_where_both_answered(
+    policy: UnifiedPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, settings = open_dataset(write_npz(tmp_path / "data")), Settings({}, changed=2)
+    replay = Replay(policy, data, data.episodes, settings)
+    selection = select(data.episodes, EVERY, 1)
+    runs = []
+    for seeds in ({2}, {0, 5}):
+        with monkeypatch.context() as patch:
+            breaking(policy, seeds, patch, together=False)
+            runs.append(replay.run(selection, lambda: None))
+    checkpoint = open_checkpoint(SMALL_POLICY)
+    report = Report(data, selection, settings, replay, runs[0], checkpoint)
+    report.add(Second(None, checkpoint, "the other"), runs[1])
+    document = report.document()
+    assert document.against is not None and document.against.moments == 3 and document.against.chunks.max == 0
+    assert [len(one.broken) for one in document.policies] == [1, 2]
+    assert {one.episode for one in document.worst} == {"episode_1", "episode_3", "episode_4"}
+    assert any(
+        note.startswith("2 answers of the other are no chunk; the first: episode episode_0") for note in document.notes
+    )
 
 
 # --- which moments ----------------------------------------------------------------------------------------------------

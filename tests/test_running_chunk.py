@@ -157,6 +157,10 @@ def test_trained_mode_holds_what_will_be_carried_out() -> None:
         (RunningChunk(rows(8), 1, schedule="cosine"), "the schedule is 'cosine'"),  # type: ignore[arg-type]
         (RunningChunk(rows(8), 1, max_guidance_weight=-1.0), "max_guidance_weight is -1.0"),
         (RunningChunk(rows(8), 1, max_guidance_weight=float("nan")), "max_guidance_weight is nan"),
+        *(
+            (RunningChunk(rows(8), 1, mode=mode, schedule="linear"), f"{mode} doesn't guide")
+            for mode in ("rtc_trained", "paint")
+        ),
         (RunningChunk(rows(8), 1, anchor=np.zeros(8)), "aren't relative to the state: leave the anchor out"),
         (rows(8), "its previous is of type ndarray; it should be a RunningChunk, or None"),
     ],

@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
-from turbopi.realtime import RealTimeExecutor
+from turbopi.realtime import ChunkQueue, RealTimeExecutor
 from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
 from turbopi.realtime.messages import KEYS, message, read_message
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
@@ -416,6 +416,25 @@ def test_what_the_server_cannot_know_or_join_is_refused(
         call(server, policy, {"place": 0, **{f"turbopi/{key}": value for key, value in second.items()}})
 
 
+@pytest.mark.parametrize("mode", sorted({*get_args(JoinMode)} - {"rtc", "rtc_identity"}))
+@pytest.mark.parametrize("option", [{"schedule": "linear"}, {"max_guidance_weight": 1.0}], ids=repr)
+def test_options_of_guidance_are_refused_by_modes_that_do_not_guide(mode: Any, option: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"turbopi/" + name: value for name, value in option.items()}
+    why = f"turbopi/{next(iter(option))} say how rtc and rtc_identity guide; {mode} doesn't guide"
+    for execution, requested in (
+        (None, {"mode": mode, "previous": LEFT, "delay": 1}),
+        (None, {"mode": mode, "session": "arm", "step": 0}),
+        (mode, {"step": 0}),
+    ):
+        server, *_ = real_time(Joins([mode]), execution=execution, control_hz=50)
+        message = {"place": 0, **{f"turbopi/{key}": value for key, value in requested.items()}}
+        server.plan(message, "c")
+        with pytest.raises(ObservationError, match=why):
+            server.plan(message | options, "another")
+    with pytest.raises(ConfigError, match=f"{next(iter(option))} say how"):
+        ChunkQueue(mode, **option)
+
+
 def test_a_server_joins_by_the_ways_there_are() -> None:
     assert get_args(JoinMode) == JOINING
 
@@ -436,10 +455,30 @@ def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text:
 
 
 @pytest.mark.parametrize(
+    ("options", "longest", "why"),
+    [
+        ({"execution": "rtc"}, 5, "chunks of 10 actions and an execution horizon of 5 at most 5 control steps fit"),
+        ({"execution": "rtc", "execution_horizon": 8}, 2, "chunks of 10 .* horizon of 8 at most 2 control steps fit"),
+        ({"execution": "rtc", "execution_horizon": 2}, 5, "an execution horizon of 2 at most 5 control steps fit"),
+        ({}, 5, "at most 5 control steps fit"),  # of named sessions
+        ({"execution": "rtc_trained"}, 2, "this checkpoint was trained with delays up to 2"),
+    ],
+)
+def test_a_fixed_delay_that_would_be_cut_in_every_call_is_refused(
+    options: dict[str, Any], longest: int, why: str
+) -> None:
+    policy = Joins()
+    policy.metadata["action_horizon"] = H
+    real_time(policy, **options, control_hz=50, delay_steps=longest)
+    with pytest.raises(ConfigError, match=f"^delay_steps={longest + 1} was asked for, but .*{why}"):
+        real_time(policy, **options, control_hz=50, delay_steps=longest + 1)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({}, ("by rtc:", "50 actions a second (--control-hz), 5 of 10 before", "delay is measured here")),
-        ({"execution": "rtc_trained", "delay_steps": 3}, ("by rtc_trained:", "the delay is 3 control steps.")),
+        ({"execution": "rtc_trained", "delay_steps": 2}, ("by rtc_trained:", "the delay is 2 control steps.")),
         ({"execution_horizon": 6, "control_hz": 12.5}, ("12.5 actions a second", "6 of 10 before")),
     ],
 )

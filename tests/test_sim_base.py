@@ -80,10 +80,10 @@ def test_the_renderer_is_chosen_from_what_is_there(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("values", "why"),
     [
-        ({"seeding": "trial"}, "seeding is 'trial'; choose episode or task"),
-        ({"seed": -1}, "seed is -1; it should be from 0 to 4294967295"),
-        ({"camera_px": 0}, "camera_px is 0; it should be from 16 to 4096"),
-        ({"wait_steps": -1}, "wait_steps is -1"),
+        ({"seeding": "trial"}, "seeding='trial' isn't one; choose episode or task"),
+        ({"seed": -1}, "seed=-1 should be from 0 to 4294967295"),
+        ({"camera_px": 0}, "camera_px=0 should be from 16 to 4096"),
+        ({"wait_steps": -1}, "wait_steps=-1 should be from 0 to 1000"),
     ],
 )
 def test_settings_out_of_range_are_refused(values: dict[str, int], why: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cli_helpers import turbopi
 from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_aloha, make_checkpoint, make_hub, relative
 
 from turbopi import UnifiedPolicy
@@ -122,6 +123,14 @@ def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: py
     with pytest.raises(TokenizerError, match="hf download NAME tokenizer"):
         UnifiedPolicy(other)
     assert UnifiedPolicy(other, tokenizer=vlm).metadata["tokenizer"] == str(vlm / "tokenizer.json")
+    own = make_checkpoint("base", tmp_path / "own")  # whose processors name that model's tokenizer
+    (own / "turbopi.json").write_text(json.dumps({"vlm": str(vlm)}))
+    assert UnifiedPolicy(own).metadata["tokenizer"] == str(vlm / "tokenizer.json")
+    assert f"OK    tokenizer   {vlm / 'tokenizer.json'}\n" in turbopi("doctor", "--checkpoint", own).stdout
+    (own / "turbopi.json").write_text(json.dumps({"vlm": str(tmp_path / "empty")}))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "config.json").write_bytes((vlm / "config.json").read_bytes())
+    assert "or give --tokenizer its folder" in turbopi("doctor", "--checkpoint", own).stdout
 
 
 @pytest.mark.parametrize(

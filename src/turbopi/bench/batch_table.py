@@ -101,6 +101,14 @@ def table_of_file(file: Path, precision: str, horizon: int) -> BatchTable:
     return _table(document.provenance.device_name, precision, horizon, timed)
 
 
+def how_to_measure(horizon: int, precision: str, backend: str = "auto") -> str:
+    """The command that measures what a plan needs, and what to do with its result."""
+    return (
+        f"`turbopi bench CHECKPOINT --backends {backend} --precisions {precision} --horizons {horizon} "
+        "--batch 1,2,4,8 --report DIR`, then give --times DIR/results.json"
+    )
+
+
 def slow(times: Times) -> float:
     """Seconds that nearly no call exceeds: the 99th percentile, or what the file has instead."""
     return (times.p99 if times.p99 is not None else times.p95) / 1e3
@@ -113,7 +121,7 @@ def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> B
         known = ", ".join(str(one) for one in sorted({one.job.horizon for one in timed if one.job.batch == 1}))
         raise ConfigError(
             f"chunks of {horizon} actions weren't measured in {precision}, one observation at a time: only of "
-            f"{known or 'none'}. Measure with `turbopi bench --horizons {horizon} --batch 1,2,4,8`"
+            f"{known or 'none'}. Measure with {how_to_measure(horizon, precision)}"
         )
     shortest = min(one.job.horizon for one in alone)
     best = min((one for one in alone if one.job.horizon == shortest), key=lambda one: one.seconds)

@@ -102,6 +102,11 @@ class LeRobotFolder:
         """How the weights of such a folder are named."""
         return PiNames()
 
+    @property
+    def named_tokenizer(self) -> Path | None:
+        """The folder of the tokenizer that the processors name; None: it is PaliGemma's, by its name."""
+        return self.pipelines.tokenizer
+
     def policy_config(self) -> PolicyConfig:
         """What the folder says, with a turbopi.json's values over it. A preset would be a second description."""
         settings = self.settings

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
-from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE
+from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
 from turbopi.config import LIMITS, Normalization, PolicyConfig
 from turbopi.models import Family
@@ -109,6 +109,15 @@ class SmolVLAFolder(LeRobotFolder):
     @property
     def vlm_name(self) -> str:
         return self.config.text("vlm_model_name", _VLM)
+
+    @property
+    def named_tokenizer(self) -> Path | None:
+        """The processors'; where that isn't here and is the vision-language model's, a turbopi.json's "vlm" has it."""
+        named, own = super().named_tokenizer, self.settings.values.get("vlm")
+        step = self.pipelines.steps[TOKENIZER].config
+        if own and not (named and (named / _TOKENIZER).is_file()) and step.text("tokenizer_name", "") == self.vlm_name:
+            return Path(own)
+        return named
 
     def _claimed(self, kind: str) -> str:
         return str(self.config.object("normalization_mapping", {}).values.get(kind, "IDENTITY"))

@@ -233,7 +233,7 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         expected_sha256=settings.weights_sha256,
         source=source,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
-        named_tokenizer=folder.pipelines.tokenizer,
+        named_tokenizer=folder.named_tokenizer,
         action_tokenizers=_action_tokenizers(settings, folder.action_tokenizers),
         action_tokenizer_name=folder.action_tokenizer_name,
     )

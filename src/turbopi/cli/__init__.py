@@ -57,7 +57,7 @@ def _root(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Pi0.5 robot policies in real time, with openpi's exact semantics.
+    """Pi0.5, Pi0, Pi0-FAST and SmolVLA robot policies in real time, with their owners' exact semantics.
 
     Start with `turbopi demo`: it needs no checkpoint and no GPU.
     """

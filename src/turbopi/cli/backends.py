@@ -1,6 +1,6 @@
 """The list of backends, a part of `turbopi doctor`, and that command's old name."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -9,23 +9,39 @@ from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import BackendUnavailable
 
+if TYPE_CHECKING:
+    import torch
+
 DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
 PrecisionOption = Annotated[
-    str,
+    str | None,
     typer.Option(
-        "--precision", metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8", help="Say what auto takes in this one."
+        "--precision",
+        metavar="bf16|f32|int8-weights|fp8|fp8-mlp|int8",
+        help="Say what auto takes in this one; else in bf16, or what the folder's weights are in.",
     ),
 ]
 
 
 @command("backends", hidden=True, examples=("turbopi backends", "turbopi backends --device cpu --json"))
-def backends(device: DeviceOption = "auto", precision: PrecisionOption = "bf16", as_json: JsonFlag = False) -> None:
+def backends(device: DeviceOption = "auto", precision: PrecisionOption = None, as_json: JsonFlag = False) -> None:
     """List the backends. A part of `turbopi doctor`, whose name this was."""
     output = Output(as_json)
-    found = list_backends(device, precision)
+    found = list_backends(device, precision or "bf16")
     show_backends(found, output)
     output.line("note: `turbopi doctor` has this list, too; `turbopi backends` goes with the next version", "yellow")
     output.document(found)
+
+
+def resolve_gpu(device: str, purpose: str) -> "torch.device":
+    """The GPU that `device` stands for. Raises BackendUnavailable where that is none; `purpose`: what needs it."""
+    from turbopi import backends
+
+    resolved = backends.resolve_device(device)
+    if resolved.type != "cuda":
+        found = "there is none here; `turbopi doctor` says why" if device == "auto" else f"--device {device} isn't one"
+        raise BackendUnavailable(f"{purpose} an NVIDIA GPU, and {found}")
+    return resolved
 
 
 def list_backends(device: str, precision: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
+from turbopi.cli.tables import tell_apart
 from turbopi.config import CAMERAS, LIMITS, ModelConfig, typed_grid
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
@@ -122,15 +123,18 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
-def _backends(names: list[str], precisions: "list[Precision]", device: "torch.device") -> list[str]:
-    """The same with "auto" as what it stands for in each precision. Raises what `backends.check` raises for that."""
+def _backends(
+    names: list[str], precisions: "list[Precision]", device: "torch.device", checkpoint: "Checkpoint"
+) -> list[str]:
+    """The same with "auto" as what it stands for in each precision. Raises what `check_backend` raises for that."""
     from turbopi import backends
+    from turbopi.policy.kept_precision import check_backend
 
     found = []
     for name, precision in itertools.product(names, precisions):
         if name == "auto":
             chosen = backends.choose(device, precision)[0]
-            backends.check(chosen, device, precision)
+            check_backend(chosen, device, precision, checkpoint)
         found.append(chosen if name == "auto" else name)
     return list(dict.fromkeys(found))
 
@@ -271,7 +275,7 @@ def bench(
         resolved = registry.resolve_device(device)
         chosen = _names(own_precision(_names(backends)) if precisions is None else precisions)
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
-        names = _backends(_names(backends), tiers, resolved)
+        names = _backends(_names(backends), tiers, resolved, opened)
         robot = options.make_robot()
         axes["--image-size"] = image_size
         own = Denoising(1).changed(None, solver, typed_grid(time_grid), ConfigError)  # type: ignore[arg-type]
@@ -373,13 +377,16 @@ def _show(document: "BenchDocument", output: Output) -> None:
 
     for precision, floor in document.floors.items():
         output.line(floors_line(precision, floor))
-    table = Table(title=f"{document.model}, {document.weights}: milliseconds, medians", title_justify="left")
-    table.add_column("backend and job")  # in one: where the table is cut into parts, each says which row is whose
+    # in one column: where the table is cut into parts, each says which row is whose
+    names, job = tell_apart([[label(one), *_job(one)] for one in document.results])
+    title = f"{document.model}, {document.weights}: milliseconds, medians"
+    table = Table(title=f"{title}\n{job}" if job else title, title_justify="left")
+    table.add_column("backend and job" if any(", " in name for name in names) else "backend")
     columns = ("vision", "prefix", "denoise", "device", "total", "p5", "p95", "p99", "floor", "x floor", "error")
     for column in columns:
         table.add_column(column, justify="right")
-    for result in document.results:
-        table.add_row(*_row(result))
+    for name, result in zip(names, document.results, strict=True):
+        table.add_row(name, *_row(result))
     output.table(table)
     for broken in document.failed:
         output.line(f"{label(broken)} failed: {broken.error}", "red")
@@ -405,18 +412,21 @@ def _show(document: "BenchDocument", output: Output) -> None:
             output.table(_profile_table(one, stage, part))
 
 
+def _job(result: "Result") -> list[str]:
+    job = result.job
+    cameras, batch, joined = f"{job.cameras} cam{job.of_size}", job.of_batch.strip(", "), job.joined.strip(", ")
+    return [cameras, f"{job.prompt_tokens} tok", f"H={job.horizon}", batch, f"{job.steps} steps", joined]
+
+
 def _row(result: "Result") -> list[str]:
-    from turbopi.bench.document import label
     from turbopi.bench.report import PERCENTILES, error_of
 
-    times, job = result.milliseconds, result.job
+    times = result.milliseconds
 
     def median(stage: str) -> str:
         return times[stage].text() if stage in times else "-"
 
     return [
-        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}"
-        f"{job.of_batch}, {job.steps} steps{job.joined}",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
         *(times["total"].text(percentile) for percentile in PERCENTILES),
         f"{result.floor_ms['total']:.2f}",

@@ -28,6 +28,7 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     from turbopi import backends
     from turbopi.policy.call_options import Denoising
     from turbopi.policy.chunk_conditioning import ChunkConditioning
+    from turbopi.policy.kept_precision import check_backend
 
     fitting = options.for_checkpoint(checkpoint)
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
@@ -35,7 +36,7 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     if name == "auto":
         backends.qualified(device, precision, model, bar=sys.stderr.isatty(), writes=writes)  # type: ignore[arg-type]
         name = backends.choose(device, precision, model, writes=writes)[0]  # type: ignore[arg-type]
-    backends.check(name, device, precision)  # type: ignore[arg-type]  # which says what is wrong with it
+    check_backend(name, device, precision, checkpoint)  # type: ignore[arg-type]
     cls = backends.class_for(name, model, writes=writes)
     requested = Denoising.of(checkpoint.config, *fitting.flow_arguments)
     no_pipeline: Any = None  # no observation is read
@@ -51,7 +52,7 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
 
 def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "Checkpoint") -> None:
     """Raise ConfigError for options of a server that the policy won't be able to follow."""
-    if server.execution is None and server.execution_horizon is None and server.max_batch is None:
+    if (server.execution, server.execution_horizon, server.delay_steps, server.max_batch) == (None,) * 4:
         return
     from turbopi.serve.calls import largest_batch
     from turbopi.serve.real_time import check_execution

@@ -209,7 +209,7 @@ def _tokenizer(info: dict[str, Any]) -> str:
     cached = cached_tokenizer()
     if cached.is_file():
         return f"none in the folder; openpi's: {cached}"
-    return "none in the folder or in openpi's cache: `turbopi doctor` says where to get it"
+    return "not found: `turbopi doctor --checkpoint` says where to get it"
 
 
 def _made_in(info: dict[str, Any]) -> str:

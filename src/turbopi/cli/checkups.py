@@ -5,7 +5,7 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from turbopi.cli.checkup import FULL_SIZE_GB, Level, Row, has_gpu, imported_torc
 from turbopi.cli.gpu_checkups import check_gpu, check_triton
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.typed import as_typed
-from turbopi.support.errors import TurboPiError
+from turbopi.support.errors import BackendUnavailable, TurboPiError
 from turbopi.support.installation import install_command
 from turbopi.support.processors import usable_processors
 from turbopi.support.toolchain import missing_for_c, missing_for_cpp
@@ -26,8 +26,8 @@ MIN_PYTHON, MIN_TORCH = (3, 10), "2.8"
 MIN_DISK_GB = 15.0
 
 
-def examine(*, checkpoint: str | None, config: str | None, tokenizer: str | None, port: int) -> Iterator[Row]:
-    """Every check, in the order in which to mend things."""
+def examine(opened: Any, about_it: list[Row], *, tokenizer: str | None, port: int) -> Iterator[Row]:
+    """Every check, in the order in which to mend things. `opened`, `about_it`: as `open_for_check`, or None and []."""
     yield check_python()
     yield check_packages()
     yield check_torch()
@@ -35,11 +35,9 @@ def examine(*, checkpoint: str | None, config: str | None, tokenizer: str | None
     yield check_triton()
     yield check_compiler()
     yield check_cpu()
-    opened, row = (None, None) if checkpoint is None else open_for_check(checkpoint, config)
-    yield check_memory(None if opened is None else opened.info()["parameters"]["total"])
-    if row is not None:
-        yield row
-    if checkpoint is None or opened is not None:  # a checkpoint that can't be opened hides its tokenizer
+    yield check_memory(None if opened is None else weights_gb(opened))
+    yield from about_it
+    if opened is not None or not about_it:  # a checkpoint that can't be opened hides its tokenizer
         yield check_tokenizer(tokenizer, opened)
     yield check_port(port)
     yield check_disk(Path.cwd())
@@ -127,28 +125,39 @@ def check_cpu() -> Row:
     return Row("OK", "CPU", found)
 
 
-def check_memory(parameters: int | None) -> Row:
-    """Host memory against the weights: a checkpoint's, or the full-size model's."""
+def weights_gb(opened: Any) -> dict[str, float]:
+    """Gigabytes of a checkpoint's weights, by the precisions that it can be loaded in; the least first."""
+    if (kept := own_precision(opened)) is not None:
+        return {kept: opened.stored_bytes / 1e9}
+    parameters = opened.info()["parameters"]["total"]
+    return {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters}
+
+
+def check_memory(weights: Mapping[str, float] | None) -> Row:
+    """Host memory against the weights: a checkpoint's (`weights_gb`), or the full-size model's."""
     import psutil
 
     available = psutil.virtual_memory().available / 1e9
     limit = cgroup_limit_gb()
     found = f"{available:.1f} GB free" + (f", at most {limit:.1f} GB allowed here" if limit is not None else "")
     usable = min(available, limit) if limit is not None else available
-    need = {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters} if parameters is not None else FULL_SIZE_GB
-    what = "this checkpoint" if parameters is not None else "full size"
-    needs = f"{what} takes {_size(need['bf16'])} in bf16, {_size(need['f32'])} in f32"
-    if usable < need["bf16"]:
-        level: Level = "FAIL" if parameters is not None and not has_gpu() else "WARN"
+    need = FULL_SIZE_GB if weights is None else weights
+    what = "full size" if weights is None else "this checkpoint"
+    needs = f"{what} takes {', '.join(f'{_size(size)} in {name}' for name, size in need.items())}"
+    least, most = min(need.values()), max(need.values())
+    if usable < least:
+        level: Level = "FAIL" if weights is not None and not has_gpu() else "WARN"
         fix = f"{needs}: free memory" + (", or load it onto a GPU" if has_gpu() else ", or use a larger machine")
         return Row(level, "memory", found, fix)
-    if usable < need["f32"]:
+    if usable < most:
         return Row("OK", "memory", f"{found}; {needs}: enough for bf16 alone")
     return Row("OK", "memory", f"{found}; {needs}")
 
 
 def _size(gigabytes: float) -> str:
-    return f"{gigabytes:.1f} GB" if gigabytes >= 0.1 else f"{1e3 * gigabytes:.0f} MB"
+    if gigabytes >= 0.1:
+        return f"{gigabytes:.1f} GB"
+    return f"{1e3 * gigabytes:.0f} MB" if gigabytes >= 1e-3 else f"{1e6 * gigabytes:,.0f} kB"
 
 
 def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:
@@ -163,38 +172,53 @@ def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:
     return None
 
 
-def open_for_check(path: str, config: str | None) -> tuple[Any, Row]:
-    """The opened checkpoint (None if it can't be), and its row."""
+def open_for_check(path: str, config: str | None, device: str) -> tuple[Any, list[Row]]:
+    """The opened checkpoint (None if it can't be), and its rows."""
+    from turbopi import backends
     from turbopi.checkpoint import open_checkpoint
+    from turbopi.policy.kept_precision import check_backend
 
     try:
         opened = open_checkpoint(path, "auto" if config is None else config)
     except TurboPiError as error:
-        return None, Row("FAIL", "checkpoint", as_typed(str(error)), "see the message")
+        return None, [Row("FAIL", "checkpoint", as_typed(str(error)), "see the message")]
     info = opened.info()
     found = (
         f"{info['path']}: {info['format']}, {info['kind']}, {info['name']} for {info['robot']}, "
         f"{info['parameters']['total'] / 1e6:,.0f} M parameters"
     )
-    return opened, Row("OK", "checkpoint", found)
+    rows = [Row("OK", "checkpoint", found)]
+    if (kept := own_precision(opened)) is not None:
+        try:
+            check_backend("fused", backends.resolve_device(device), kept, opened)
+        except BackendUnavailable as error:
+            rows.append(Row("FAIL", "precision", as_typed(str(error)), "see the message"))
+        else:
+            rows.append(Row("OK", "precision", f"{kept}, which the folder's weights are in"))
+    return opened, rows
+
+
+def own_precision(opened: Any) -> Any:
+    """What an opened checkpoint's weights run in alone; None where there is a choice, or no checkpoint."""
+    if opened is None:  # nor, maybe, a PyTorch that can be imported
+        return None
+    from turbopi.checkpoint.quantized_folder import precision_kept
+
+    return precision_kept(opened)
 
 
 def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
     """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning."""
     from turbopi.config import ModelConfig
-    from turbopi.preprocess.tokenizer import load_tokenizer
+    from turbopi.preprocess.tokenizer import load_tokenizer, tokenizer_of
 
-    vocab_size = ModelConfig().vocab_size if checkpoint is None else checkpoint.config.model.vocab_size
     try:
-        loaded = load_tokenizer(
-            given,
-            vocab_size=vocab_size,
-            checkpoint_dir=None if checkpoint is None else checkpoint.path,
-            named=None if checkpoint is None else checkpoint.named_tokenizer,
-            candidates=() if checkpoint is None else checkpoint.tokenizer_candidates,
-        )
+        if checkpoint is None:
+            loaded = load_tokenizer(given, vocab_size=ModelConfig().vocab_size)
+        else:
+            loaded = tokenizer_of(checkpoint, given)
     except TurboPiError as error:
-        first, *rest = str(error).splitlines()
+        first, *rest = as_typed(str(error)).splitlines()
         fix = " && ".join(line.strip() for line in rest if "curl" in line or "mkdir" in line) or "see the message"
         if checkpoint is None and given is None:
             return Row("WARN", "tokenizer", "PaliGemma's isn't here; a real checkpoint needs it", fix)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from turbopi.cli.backends import DeviceOption, PrecisionOption, list_backends, show_backends
+from turbopi.cli.backends import DeviceOption, PrecisionOption, list_backends, resolve_gpu, show_backends
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.support.errors import BackendUnavailable, ConfigError
 from turbopi.support.reading import plain_document
@@ -26,6 +26,9 @@ STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
     ),
 )
 def doctor(
+    folder: Annotated[
+        str | None, typer.Argument(metavar="CHECKPOINT", help="As --checkpoint.", show_default=False)
+    ] = None,
     checkpoint: Annotated[
         str | None, typer.Option("--checkpoint", metavar="CHECKPOINT", help="Check this one, and its needs, too.")
     ] = None,
@@ -39,7 +42,7 @@ def doctor(
         int, typer.Option("--port", metavar="N", min=1, max=65535, help="That `turbopi serve` would take.")
     ] = 8000,
     device: DeviceOption = "auto",
-    precision: PrecisionOption = "bf16",
+    precision: PrecisionOption = None,
     qualify: Annotated[
         bool,
         typer.Option(
@@ -56,12 +59,18 @@ def doctor(
     itself, in one.
     """
     output = Output(as_json)
-    from turbopi.cli.checkups import examine, system
+    from turbopi.cli.checkups import examine, open_for_check, own_precision, system
 
+    if folder is not None:
+        if checkpoint is not None:
+            raise ConfigError(f"{folder} and --checkpoint {checkpoint} each name a checkpoint: give one of them")
+        checkpoint = folder
     if force and not qualify:
         raise ConfigError("--force goes with --qualify")
     verdict = run_qualification(checkpoint, config, device, precision, force, output) if qualify else {}
-    rows = list(examine(checkpoint=checkpoint, config=config, tokenizer=tokenizer, port=port))
+    opened, about_it = (None, []) if checkpoint is None else open_for_check(checkpoint, config, device)
+    precision = precision or own_precision(opened) or "bf16"
+    rows = list(examine(opened, about_it, tokenizer=tokenizer, port=port))
     works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
     found = list_backends(device, precision) if works else {}
     width = max(len(row.name) for row in rows)
@@ -82,18 +91,19 @@ def doctor(
 
 
 def run_qualification(
-    checkpoint: str | None, config: str | None, device: str, precision: str, force: bool, output: Output
+    checkpoint: str | None, config: str | None, device: str, precision: str | None, force: bool, output: Output
 ) -> dict[str, Any]:
     """The verdict on `fused` on a GPU, and its file, said and as JSON values. Raises BackendUnavailable without one."""
     from turbopi import backends
     from turbopi.backends import qualification, qualifying
     from turbopi.checkpoint import open_checkpoint
+    from turbopi.cli.checkups import own_precision
     from turbopi.config import ModelConfig, Network
 
-    model: Network = ModelConfig()
-    if checkpoint is not None:
-        model = open_checkpoint(checkpoint, "auto" if config is None else config).config.model
-    resolved, tier = backends.resolve_device(device), backends.checked_precision(precision)
+    resolved = resolve_gpu(device, "--qualify tries backend fused on")
+    opened = None if checkpoint is None else open_checkpoint(checkpoint, "auto" if config is None else config)
+    model: Network = ModelConfig() if opened is None else opened.config.model
+    tier = backends.checked_precision(precision or own_precision(opened) or "bf16")
     if (why := backends.refusal("fused", resolved, tier, model)) is not None:
         raise BackendUnavailable(f"there is nothing to qualify: {why}")
     verdict = None if force else qualification.kept(resolved, tier, model)

@@ -1,8 +1,9 @@
 """`turbopi eval`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,12 +18,14 @@ from turbopi.cli.evaluate_options import COMMON_EVAL, EvalOptions
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.tables import tell_apart
+from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
-    from turbopi.evaluate.delays import Cell
+    from turbopi.evaluate.delays import Cell, CellSummary
     from turbopi.evaluate.plan import Job, Protocol
     from turbopi.evaluate.results import Episode, Results
     from turbopi.evaluate.run import OnEpisode
@@ -85,6 +88,12 @@ def evaluate_command(
     result isn't complete.
     """
     output = Output(as_json)
+    from turbopi.evaluate.controls import Controlled, check_control
+    from turbopi.sim import SIMULATORS
+
+    if simulator not in SIMULATORS and Path(simulator).is_dir():
+        raise ConfigError(f"{simulator} is a folder, but the simulator comes first: turbopi eval SIMULATOR CHECKPOINT")
+    check_control(control)
     options.check_real_time()
     remote = host is not None or port is not None
     if remote:
@@ -115,8 +124,6 @@ def evaluate_command(
         for cell in cells:
             check_way(source, cell.protocol(protocol))
         if control is not None:
-            from turbopi.evaluate.controls import Controlled
-
             instructions = [job.task.instruction for job in jobs]
             source = Controlled(source, control, instructions, chosen.image_keys)  # type: ignore[arg-type]
         folder = options.out or DEFAULT_OUT / _folder_name(protocol.suite, source.label, source.about)
@@ -159,7 +166,7 @@ def _run_cells(
 ) -> bool:
     """Each cell in a folder of its own, and the report of all. Returns whether every episode has a verdict."""
     from turbopi.evaluate.checks import check_delay, check_fit
-    from turbopi.evaluate.delays import FILE, document, heads, notes, row, write_delays
+    from turbopi.evaluate.delays import FILE, document, notes, write_delays
 
     check_replaces(folder / FILE, "cells", "a report of `turbopi eval`")
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, min(cell.horizon for cell in cells))
@@ -174,18 +181,37 @@ def _run_cells(
     finally:
         page = write_delays(folder, done) if done else None
     reported = document(done)
-    table = Table(title=escape(f"{protocol.suite} under delay: {source.label}"), title_justify="left")
-    for head in heads(reported.cells):
-        table.add_column(escape(head), justify="left" if head == "execution" else "right")
-    for summary in reported.cells:
-        table.add_row(*row(summary))
-    output.table(table)
+    output.table(_delays_table(f"{protocol.suite} under delay: {source.label}", reported.cells))
     for note in notes(reported.cells, protocol.control_hz):
         output.line(note, "yellow")
     output.line(f"report: {page}")
     cells_reported = plain_document(reported)["cells"]
     output.document({"folder": folder, "file": FILE, "first": reported.first, "cells": cells_reported})
     return all(results.complete for _, results in done)
+
+
+def _delays_table(title: str, cells: "Sequence[CellSummary]") -> Table:
+    """As on the page, but for the way, the delay and the horizon, which are in one column: where the table is cut into
+    parts, each says which row is whose. Columns in which no row has a number are left out.
+    """
+    from turbopi.evaluate.delays import heads, row
+
+    measured = cells[0].delay is None  # and then it is a column
+    ways = [[one.execution, "" if measured else f"delay {one.delay}", f"horizon {one.horizon}"] for one in cells]
+    names, shared = tell_apart(ways)
+    table = Table(title=escape(f"{title}, {shared}" if shared else title), title_justify="left")
+    table.add_column("execution")
+    of_way = ("execution", "horizon") if measured else ("execution", "delay", "horizon")
+    columns = [
+        (head, texts)
+        for head, *texts in zip_longest(heads(cells), *map(row, cells), fillvalue="-")
+        if head not in of_way and set(texts) != {"-"}
+    ]
+    for head, _ in columns:
+        table.add_column(escape(head), justify="right")
+    for name, *texts in zip(names, *(texts for _, texts in columns), strict=True):
+        table.add_row(name, *map(escape, texts))
+    return table
 
 
 def _refuse_policy_options(options: EvalOptions) -> None:
@@ -281,7 +307,7 @@ def _reported(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
 
 
 def _line(episode: "Episode") -> str:
-    why = f" ({episode.message.strip().splitlines()[-1]})" if episode.message else ""
+    why = f" ({as_typed(episode.message.strip().splitlines()[-1])})" if episode.message else ""
     return (
         f"task {episode.task}, initial state {episode.initial_state}: {episode.status} after {episode.steps} steps, "
         f"{episode.seconds:.0f} s{why}"

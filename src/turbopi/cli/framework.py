@@ -46,7 +46,7 @@ from turbopi.support.reading import plain_document
 
 CHECK_FAILED, OUR_FAULT = 1, 3
 MAX_MESSAGE = 2000  # characters of an error
-PLAIN_WIDTH = 140  # columns of tables where there is no terminal
+PLAIN_WIDTH = 80  # columns of tables where there is no terminal, unless COLUMNS says otherwise
 
 app = typer.Typer(
     name="turbopi",
@@ -103,7 +103,7 @@ class Output:
 
 
 def new_console(*, stderr: bool) -> Console:
-    """A console that doesn't squeeze tables into 80 columns when its output goes to a file or a pipe."""
+    """A console whose width is the terminal's, and in a file or a pipe PLAIN_WIDTH, whatever terminal is near."""
     console = Console(stderr=stderr)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = PLAIN_WIDTH

@@ -144,9 +144,10 @@ def judge_precision(name: str, device: Any, precision: Any, memory_gb: float, fi
     assert need is not None
     found = f"{chosen}: {why}; full size takes {need:.1f} GB"
     if need > memory_gb:
-        others = [f"{other} ({gb:.1f} GB)" for other, gb in fitting.items()]
-        instead = f"turbopi calibrate CHECKPOINT, then --precision {others[0]}" if others else ""
-        fix = instead or f"a GPU with {need:.0f} GB or more; --random-weights pi05_tiny runs here"
+        fix = f"a GPU with {need:.0f} GB or more; --random-weights pi05_tiny runs here"
+        if fitting:
+            other, size = next(iter(fitting.items()))
+            fix = f"turbopi calibrate CHECKPOINT --precision {other}, then --precision {other} ({size:.1f} GB)"
         return Row("WARN", name, f"{found}, more than there is", fix)
     faster = backends.availability("fused", device) if chosen != "fused" else None
     fix = "" if faster is None else command_in(faster)

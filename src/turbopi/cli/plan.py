@@ -106,6 +106,7 @@ def plan(
 def _untried(table: "BatchTable") -> str | None:
     """Why `auto` wouldn't run this there; None if it would."""
     from turbopi.backends.qualification import KNOWN
+    from turbopi.bench.batch_table import how_to_measure
     from turbopi.bench.gpus import find_gpu
     from turbopi.quantization.plan import TIERS
 
@@ -117,12 +118,14 @@ def _untried(table: "BatchTable") -> str | None:
         return None
     return (
         f"{table.backend} was never run on a {gpu.name}, where `auto` qualifies it first. Measure yours with "
-        f"`turbopi bench --backends {table.backend} --horizons {table.job.horizon} --batch 1,2,4,8`, then give --times"
+        f"{how_to_measure(table.job.horizon, table.precision, table.backend)}"
     )
 
 
 def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
+    from turbopi.bench.batch_table import how_to_measure
+    from turbopi.quantization.plan import TIERS
     from turbopi.serve.fleet.fleet import MOST_AT_ONCE
     from turbopi.serve.options import ServerOptions
 
@@ -131,10 +134,13 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     serve = (
         f"turbopi serve CHECKPOINT --backend {table.backend} --precision {table.precision} --max-batch {planned.batch}"
     )
+    if planned.gpus > 1:
+        serve += f" --ray --replicas {planned.gpus}"
     if planned.queue_limit > ServerOptions.queue_limit:
         serve += f" --queue-limit {planned.queue_limit}"
     if fleet.robots > ServerOptions.max_clients:
         serve += f" --max-clients {fleet.robots}"
+    calibrate = f"turbopi calibrate CHECKPOINT --precision {table.precision} --observations RECORDING"
     a_second = fleet.robots * fleet.hz / fleet.steps
     untried = _untried(table)
     each_has = f"{planned.robots_per_gpu} robot{'s' * (planned.robots_per_gpu > 1)}"
@@ -149,9 +155,8 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         f"delay        {planned.delay_steps} control steps at most "
         f"({planned.worst_seconds * 1e3:.1f} ms and {fleet.overhead(planned.gpus):g} ms overhead)",
         f"utilisation  {planned.utilisation:.0%}",
-        f"{RUN}          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else "")
-        if untried is None
-        else f"no command is recommended: {untried}",
+        *([f"{RUN} first    {calibrate}"] if table.precision in TIERS and untried is None else []),
+        f"{RUN}          {serve}" if untried is None else f"no command is recommended: {untried}",
     ]
     if fleet.steps == fleet.horizon:
         reported.append("Robots carry out whole chunks, and stand still for the delay")
@@ -162,6 +167,6 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     if (servers := math.ceil(a_second / DECODED)) > 1:
         reported.append(f"One server decodes some {DECODED} observations a second: take {servers} servers")
     if fleet.robots > 1 and len(table.seconds) == 1:
-        options = f"--horizons {table.job.horizon} --batch 1,2,4,8"
-        reported.append(f"Batches of such chunks weren't measured there: `turbopi bench {options}`, then --times")
+        measure = how_to_measure(table.job.horizon, table.precision, table.backend)
+        reported.append(f"Batches of such chunks weren't measured there. Measure them with {measure}")
     return reported

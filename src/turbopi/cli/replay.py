@@ -16,6 +16,7 @@ from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
+from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -271,13 +272,13 @@ def _show(document: "ReplayDocument", output: Output) -> None:
         "dim",
     )
     for note in document.notes:
-        output.line(f"note: {note}", "yellow")
+        output.line(as_typed(f"note: {note}"), "yellow")
     if document.against is not None:
         output.line(against_text(document))
     colour = {"follows": "bold green", "differs": "bold red"}.get(document.verdict.level, "bold yellow")
     output.line(document.verdict.text, colour)
     for hint in document.verdict.hints:
-        output.line(f"- {hint}", "yellow")
+        output.line(as_typed(f"- {hint}"), "yellow")
 
 
 def _table(title: str, heads: "Sequence[str]", rows: "Sequence[Sequence[str]]", numbers_from: int = 1) -> Table:

@@ -14,6 +14,17 @@ COMFORTABLE = 24  # columns that a text gets, if it needs them, before a table i
 _LONGEST_WORD = 40  # characters; what is longer, such as a path, goes on in the next line
 
 
+def tell_apart(rows: Sequence[Sequence[str]]) -> tuple[list[str], str]:
+    """(a name for each row, what all have in common), of rows' parts: as many for each, "" for what one hasn't.
+
+    The first part is always in the name.
+    """
+    differ = [number == 0 or len(set(parts)) > 1 for number, parts in enumerate(zip(*rows, strict=True))]
+    names = [", ".join(part for part, own in zip(row, differ, strict=True) if own and part) for row in rows]
+    shared = [part for part, own in zip(rows[0], differ, strict=True) if not own and part] if rows else []
+    return names, ", ".join(shared)
+
+
 def fitted(table: Table, console: Console) -> list[Table]:
     """`table` if it fits, else without its edge, else in parts that each repeat the first column."""
     for column in table.columns:

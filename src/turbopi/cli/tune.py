@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from turbopi.cli import files
+from turbopi.cli.backends import resolve_gpu
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.cli.progress import with_stages
@@ -149,14 +150,8 @@ def usable_device(device: str) -> "torch.device":
     """The GPU that `fused` would run on. Raises BackendUnavailable where it can't."""
     from turbopi import backends
 
-    resolved = backends.resolve_device(device)
-    reason = backends.availability("fused", resolved)
-    if resolved.type != "cuda":
-        raise BackendUnavailable(
-            "tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why. --dry-run needs "
-            "it, too: which tiles there are depends on the GPU"
-        )
-    if reason is not None:
+    resolved = resolve_gpu(device, "tiles are measured, and for --dry-run listed, on")
+    if (reason := backends.availability("fused", resolved)) is not None:
         raise BackendUnavailable(f"tiles are those of backend fused, which can't run here: {reason}")
     return resolved
 

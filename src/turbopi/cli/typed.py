@@ -42,7 +42,16 @@ OF_SERVERS = {
     "delay_steps": "--delay-steps",
     "autoscaling": "--autoscaling",
 }
-OPTIONS = {**OF_POLICIES, **OF_SERVERS}
+OF_EVALUATIONS = {
+    "seed": "--seed",
+    "seeding": "--seeding",
+    "replan": "--replan",
+    "wait_steps": "--wait-steps",
+    "max_steps": "--max-steps",
+    "camera_px": "--camera-px",
+    "image_px": "--image-px",
+}
+OPTIONS = {**OF_POLICIES, **OF_SERVERS, **OF_EVALUATIONS}
 _ARGUMENT = re.compile(  # config=, config='auto', queue_limit=-1
     rf"""(?<![\w/.-])({"|".join(OPTIONS)})=(?:(['"])(.*?)\2|([^\s,;:()'"]+(?<!\.)))?"""
 )

@@ -17,6 +17,12 @@ CONTROLS: tuple[Control, ...] = ("prompt", "pictures")
 _GRAY = 128
 
 
+def check_control(control: str | None) -> None:
+    """Raise ConfigError for a name that isn't one."""
+    if control is not None and control not in CONTROLS:
+        raise ConfigError(f"the control is {control!r}; choose one of {', '.join(CONTROLS)}")
+
+
 class Controlled:
     """A policy source that hands wrong observations on to another one.
 
@@ -30,8 +36,7 @@ class Controlled:
     def __init__(
         self, source: PolicySource, control: Control, instructions: Sequence[str], image_keys: Sequence[str]
     ) -> None:
-        if control not in CONTROLS:
-            raise ConfigError(f"the control is {control!r}; choose one of {', '.join(CONTROLS)}")
+        check_control(control)
         self._order = list(dict.fromkeys(instructions))
         if len(self._order) < 2:
             raise ConfigError(f"the control {control!r} takes another task's, but only one is evaluated; give more")

@@ -260,13 +260,17 @@ def heads(cells: Sequence[CellSummary]) -> tuple[str, ...]:
 
 
 def notes(cells: Sequence[CellSummary], control_hz: float | None) -> list[str]:
-    """What a reader must know before the numbers: where the simulator couldn't keep up with the clock."""
+    """What a reader must know before the numbers: where ways are the same, or the simulator was behind the clock."""
+    undelayed = [way for cell in cells if cell.delay == 0 and (way := way_named(cell.execution)).plain_without_delay]
+    same = list(dict.fromkeys(way.name for way in undelayed))
+    plain = "these are ordinary calls, which need nothing of the chunk before"
     found = [
         (cell.execution, allows_for_lateness(cell.real_time, control_hz))
         for cell in cells
         if cell.real_time is not None and control_hz is not None
     ]
-    return [f"{execution}: {reported}" for execution, reported in found if reported is not None]
+    late = [f"{execution}: {reported}" for execution, reported in found if reported is not None]
+    return [f"the same with a delay of 0: {', '.join(same)}; {plain}", *late] if len(same) > 1 else late
 
 
 def row(cell: CellSummary) -> list[str]:

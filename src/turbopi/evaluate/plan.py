@@ -42,16 +42,16 @@ class Protocol:
     def __post_init__(self) -> None:
         way_named(self.execution)
         if self.control_hz is not None and not 0 < self.control_hz <= MAX_CONTROL_HZ:
-            raise ConfigError(f"control_hz is {self.control_hz}; it should be above 0, at most {MAX_CONTROL_HZ}")
+            raise ConfigError(f"control_hz={self.control_hz} should be above 0, at most {MAX_CONTROL_HZ}")
         if self.control_hz is not None and self.delay:
             raise ConfigError(f"a delay of {self.delay} steps can't be simulated in real time, where it is measured")
         if not 0 <= self.delay <= 1000:
             raise ConfigError(f"the delay is {self.delay} control steps; it should be from 0 to 1000")
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
             if value is not None and value < 1:
-                raise ConfigError(f"{name} is {value}; it should be at least 1")
+                raise ConfigError(f"{name}={value} should be at least 1")
         if self.image_px > MAX_PX:
-            raise ConfigError(f"image_px is {self.image_px}; it should be {MAX_PX} at most")
+            raise ConfigError(f"image_px={self.image_px} should be {MAX_PX} at most")
 
 
 @dataclass(frozen=True)

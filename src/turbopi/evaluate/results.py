@@ -176,11 +176,11 @@ class Results:
         """Take over the episodes of an interrupted run. Raises ConfigError if they were run in another way."""
         mine, theirs = _flat(plain(self._decisive())), _flat(plain(earlier._decisive()))
         for name in sorted({*mine, *theirs}):
-            if mine.get(name) != theirs.get(name):
+            own, other = (one.get(name, _UNDELAYED.get(name)) for one in (mine, theirs))
+            if own != other:
                 raise ConfigError(
-                    f"{self.folder} holds a run with {name} = {theirs.get(name)!r}, but this one has "
-                    f"{mine.get(name)!r}: give another --out, or begin again (of `turbopi eval` with --restart, of a "
-                    "study by deleting that folder)"
+                    f"{self.folder} holds a run with {name} = {other!r}, but this one has {own!r}: give another --out, "
+                    "or begin again (of `turbopi eval` with --restart, of a study by deleting that folder)"
                 )
         self.episodes = dict(earlier.episodes)
         self.planned |= earlier.planned
@@ -265,6 +265,9 @@ class Results:
     def _decisive(self) -> Plain:
         simulator = {name: value for name, value in self.versions.items() if name == "simulator"}
         return {"protocol": self.protocol, "policy": self.policy.identity, "versions": simulator}
+
+
+_UNDELAYED = {"protocol.execution": "sync", "protocol.delay": 0}  # what `protocol_json` leaves out
 
 
 def protocol_json(protocol: Protocol) -> Plain:

@@ -37,6 +37,7 @@ from turbopi.policy.call_options import (
 )
 from turbopi.policy.chunk_conditioning import ChunkConditioning, flags, of_each
 from turbopi.policy.history import History, ObservationHistory
+from turbopi.policy.kept_precision import check_backend
 from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.model_call import ModelCall
 from turbopi.policy.readings import Checks, OutOfRange
@@ -48,7 +49,7 @@ from turbopi.preprocess.tokenizer import tokenizer_of
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.realtime.running_chunk import JoinMode, RunningChunk
 from turbopi.robots import Robot
-from turbopi.support.errors import ActionError, BackendUnavailable, ConfigError, ObservationError
+from turbopi.support.errors import ActionError, ConfigError, ObservationError
 
 logger = logging.getLogger(__name__)
 
@@ -121,19 +122,10 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         known = None if known_cameras is None else KnownCameras.load(known_cameras)
-        kept = precision_kept(checkpoint_dir)
-        precision = precision or kept or "bf16"
+        precision = precision or precision_kept(checkpoint_dir) or "bf16"
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
-        try:
-            backends.check(name, self._device, precision)  # before a calibration is looked for, and weights are read
-        except BackendUnavailable as error:
-            if precision != kept:
-                raise
-            raise BackendUnavailable(
-                f"{getattr(checkpoint_dir, 'path', checkpoint_dir)} keeps its weights in {kept}, and "
-                f"{str(error).partition(';')[0]}: take the checkpoint that it was made from"
-            ) from error
+        check_backend(name, self._device, precision, checkpoint_dir)  # before a calibration and weights are read
 
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)

@@ -18,7 +18,7 @@ import numpy as np
 from turbopi.config import RealTime, Schedule
 from turbopi.realtime.chunk import Chunk, NotFinite, checked_max_jump, mix, read_chunk, too_far
 from turbopi.realtime.delays import DelayEstimate, number_up_to
-from turbopi.realtime.running_chunk import RunningChunk
+from turbopi.realtime.running_chunk import RunningChunk, refuses_guidance
 from turbopi.realtime.ways import Execution, way_named
 from turbopi.support.errors import ActionError, ConfigError
 
@@ -121,7 +121,7 @@ class ChunkQueue:
                          last command to its first action, is refused whole
     old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
     schedule, max_guidance_weight
-                         of the guided ways, as in RunningChunk. None: the policy's
+                         of the guided ways, as in RunningChunk; others refuse them. None: the policy's
     policys_guidance     True: the policy isn't told s, so guidance ends by its own execution horizon (LeRobot's
                          rtc_config)
 
@@ -165,6 +165,8 @@ class ChunkQueue:
         self._old_weight = number_up_to(1, "old_weight", old_weight)
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
         RealTime(**{name: value for name, value in self._guidance.items() if value is not None})  # checks them
+        if (why := refuses_guidance(self.way.name, self._guidance)) is not None:
+            raise ConfigError(why)
         self._policys_guidance = policys_guidance
         self._requests = 0
         self._running: Chunk | None = None
@@ -456,6 +458,11 @@ class ChunkQueue:
 def default_execution_horizon(horizon: int) -> int:
     """s, control steps, of chunks of `horizon` actions: half."""
     return max(1, horizon // 2)
+
+
+def longest_delay(horizon: int, s: int) -> int:
+    """The most control steps d from an observation to its chunk: d ≤ H − s, and as s is d at least, d ≤ H / 2."""
+    return min(horizon - s, horizon // 2)
 
 
 def _horizon(s: int) -> int:

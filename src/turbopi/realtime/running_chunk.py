@@ -1,5 +1,6 @@
 """The action chunk that a robot carries out while the policy computes the next one: what the next one must join."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -19,6 +20,7 @@ FORMS: "dict[JoinMode, Form]" = {
     "warm_start": "solver",
     "paint": "noise",
 }
+GUIDED: tuple[JoinMode, ...] = ("rtc", "rtc_identity")
 WARM_START = 0.6  # t at which a warm start begins: so much noise, and the rest is the running chunk
 
 
@@ -46,7 +48,7 @@ class RunningChunk:
                        new state
     schedule, max_guidance_weight
                        of the guided modes' pull, see `conditioning.guidance_weights` and `guidance_strength`. None: the
-                       policy's
+                       policy's. Other modes take neither
     """
 
     left_over: np.ndarray
@@ -66,6 +68,9 @@ class RunningChunk:
         """
         if self.mode not in get_args(JoinMode):
             raise ObservationError(f"the mode is {self.mode!r}; it should be one of {', '.join(get_args(JoinMode))}")
+        guidance = {"schedule": self.schedule, "max_guidance_weight": self.max_guidance_weight}
+        if (why := refuses_guidance(self.mode, guidance)) is not None:
+            raise ObservationError(why)
         left_over = self._checked_left_over(horizon, action_dim)
         if relative and self.anchor is None:
             raise ObservationError(
@@ -192,6 +197,16 @@ class RunningChunk:
                 f"the delay is {delay} control steps, but this checkpoint was trained with delays up to {trained}: use "
                 'mode "rtc", or make the delay shorter (fewer denoising steps, a lower control rate)'
             )
+
+
+def refuses_guidance(mode: str, given: Mapping[str, object]) -> str | None:
+    """Why a mode, or way to run, takes none of these options of guidance, by name; None if it takes them, or none is
+    given.
+    """
+    names = [name for name, value in given.items() if value is not None]
+    if not names or mode in GUIDED:
+        return None
+    return f"{' and '.join(names)} say how {' and '.join(GUIDED)} guide; {mode} doesn't guide: leave them out"
 
 
 def _whole(what: str, number: object, low: int, high: int) -> int:

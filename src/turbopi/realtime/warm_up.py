@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from turbopi.realtime import Way
+from turbopi.realtime.queue import longest_delay
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import ConfigError
 
@@ -64,10 +65,10 @@ def expected_delay(
             f"{slow}, but this checkpoint was trained with delays up to {trained_max}: choose {faster}, or execution "
             "'rtc'"
         )
-    if way.mode is not None and delay > horizon - max(s, delay):
+    if way.mode is not None and delay > longest_delay(horizon, s):
         raise ConfigError(
             f"{slow}: with chunks of {horizon} actions and an execution horizon of {s}, {way.name} joins chunks up to "
-            f"a delay of {min(horizon - s, horizon // 2)}: choose {faster}"
+            f"a delay of {longest_delay(horizon, s)}: choose {faster}"
         )
     if way.mode is None and not way.stands_still and delay > horizon - s:
         fits = f"an execution horizon of at most {horizon - delay}, or " if delay < horizon else ""

@@ -26,6 +26,11 @@ class Way:
         """The new chunk repeats the running one's actions up to the delay it was told, and fits to nothing else."""
         return self.mode == "rtc_trained"
 
+    @property
+    def plain_without_delay(self) -> bool:
+        """With a delay of 0 a chunk is an ordinary call's, carried out from its first action on."""
+        return not self.averages and self.mode in (None, "rtc_trained", "paint")
+
 
 WAYS: dict[str, Way] = {
     "sync": Way("sync", stands_still=True),

@@ -155,6 +155,7 @@ def policy_document(one: Compared, checkpoint: str, action_names: Sequence[str] 
         joints,
         float(np.median(run.call_ms)),
         changes(one),
+        list(run.broken),
     )
 
 

@@ -67,8 +67,16 @@ class Changed(Struct, frozen=True):
     nearer: int
 
 
+class Broken(Struct, frozen=True):
+    """A moment whose answer no robot may be given, and why."""
+
+    episode: str
+    step: int
+    why: str
+
+
 class PolicyDocument(Struct, frozen=True):
-    """A policy's errors over the moments."""
+    """A policy's errors over the moments that it answered; `broken`: those that it didn't."""
 
     label: str
     checkpoint: str
@@ -79,6 +87,7 @@ class PolicyDocument(Struct, frozen=True):
     joints: list[Joint]
     call_ms: float  # median; a batch's time is its rows' together
     changed: list[Changed]
+    broken: list[Broken] = []
 
 
 class Against(Struct, frozen=True):

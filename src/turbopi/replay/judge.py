@@ -6,7 +6,7 @@ import numpy as np
 
 from turbopi.replay.compare import HELD, MEAN, NEVER_MOVED, OTHERS, Compared
 from turbopi.replay.document import Changed, Control, Level, PolicyDocument, State, Verdict
-from turbopi.replay.run import reach_of
+from turbopi.replay.run import broken_text, reach_of
 from turbopi.support.text import significant
 
 FOLLOWS, PARTLY = 0.5, 0.8  # of the error of a chunk that knows nothing of the moment
@@ -27,7 +27,7 @@ def judge(
     error, moments = document.relative.mean, len(one.by_moment)
     if moments < LEAST or not knowing_nothing:
         text = f"Too few moments to judge: {moments}. Take more episodes, or a smaller --every."
-        return Verdict("too few", text, list(_hints(one, document, states, "too few")))
+        return Verdict("too few", text, [*_hints(one, document, states, "too few"), *_of_broken(one)])
     lowest, held = min(knowing_nothing), values.get(HELD, np.inf)
     share = error / lowest if lowest > 0 else np.inf
     level: Level = "differs" if share > PARTLY else "partly" if share > FOLLOWS or error > held else "follows"
@@ -48,7 +48,16 @@ def judge(
             f"--rename)? Is the prompt the training's (“{prompt}”, --task)? Are the actions of the same kind: "
             "positions or differences, joints or end effector?"
         ]
-    return Verdict(level, text, hints)
+    return Verdict(level, text, [*hints, *_of_broken(one)])
+
+
+def _of_broken(one: Compared) -> Iterator[str]:
+    broken, answered = one.run.broken, len(one.by_moment)
+    if broken:
+        yield (
+            f"{len(broken)} of {len(broken) + answered} answers are no chunk that a robot may be given, and are left "
+            f"out of the errors: there the robot would hold. The first: {broken_text(broken[0])}"
+        )
 
 
 def _hints(one: Compared, document: PolicyDocument, states: Sequence[State], level: Level) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,9 @@ from turbopi.replay.document import Control, DatasetDocument, PolicyDocument, Re
 from turbopi.replay.episodes import Dataset, Selection
 from turbopi.replay.judge import judge
 from turbopi.replay.page import Material, write_report
-from turbopi.replay.run import Replay, Replayed, Settings
+from turbopi.replay.run import Replay, Replayed, Settings, broken_text
 from turbopi.support.action_groups import names_of as names_in
-from turbopi.support.errors import ConfigError
+from turbopi.support.errors import ActionError, ConfigError
 from turbopi.support.provenance import provenance
 from turbopi.support.text import significant
 
@@ -70,9 +71,6 @@ class Report:
         self._checkpoints = [checkpoint]
         self._device = torch.device(str(run.about["device"]))
         self._compared = [compared(f"{name_of(checkpoint)}, {_way(run)}", run)]
-        self._rows = worst_moments(self._compared[0], WORST)
-        self._observations = [replay.observation_at(*run.moments[row]) for row in self._rows]
-        self._prompt_key = run.keys.prompt
         self._key_notes = replay.notes
 
     def add(self, second: Second, run: Replayed) -> None:
@@ -87,13 +85,19 @@ class Report:
         label = _way(first.run) if second.checkpoint is own else name_of(own)
         if label == second.label:
             label = str(own.path)
-        self._compared = [compared(label, first.run), compared(second.label, run, first.run.units)]
+        both = [moment for moment in first.run.moments if moment in run.moments]
+        if not both:
+            raise ActionError(f"--against {second.label} answered at none of the moments that the first policy did")
+        own_run, other = (one.only([one.moments.index(moment) for moment in both]) for one in (first.run, run))
+        self._compared = [compared(label, own_run), compared(second.label, other, own_run.units)]
         self._checkpoints.append(second.checkpoint)
 
     def write(self, folder: Path) -> ReplayDocument:
         """Write the report; returns its document. CAMERAS are written if nothing shows a mistake, else removed."""
         document = self.document()
-        material = Material(self._compared, self._rows, self._observations, self._dataset.action_names)
+        rows = [row for row, _ in self._worst_moments]
+        observations = [observation for _, observation in self._worst_moments]
+        material = Material(self._compared, rows, observations, self._dataset.action_names)
         write_report(folder, document, material)
         known = KnownCameras.of_samples(self._compared[0].run.cameras) if document.verdict.passed else None
         if known is None:
@@ -111,7 +115,7 @@ class Report:
         ]
         beside = controls(first)
         states = state_documents(first.run, self._state_names())
-        prompts = [self._prompt(observation) for observation in self._observations]
+        worst = [self._worst(row, self._prompt(observation)) for row, observation in self._worst_moments]
         return ReplayDocument(
             DatasetDocument(
                 str(dataset.path),
@@ -128,8 +132,8 @@ class Report:
             against(*self._compared) if len(self._compared) > 1 else None,
             beside,
             states,
-            [self._worst(row, prompt) for row, prompt in zip(self._rows, prompts, strict=True)],
-            judge(first, policies[0], beside, states, prompts[0]),
+            worst,
+            judge(first, policies[0], beside, states, worst[0].prompt),
             list(self._notes(first, policies[0], beside)),
             provenance(self._device),
         )
@@ -140,9 +144,21 @@ class Report:
         of_data = self._dataset.names_of(numbers[0]) if len(numbers) == 1 else None
         return tuple(names_in(about, "state") or ()) if of_data is None else of_data
 
+    @cached_property
+    def _worst_moments(self) -> list[tuple[int, dict[str, Any]]]:
+        """Of the first policy: the row, and the observation."""
+        first, keys = self._compared[0], self._compared[0].run.keys
+        self._dataset.wanted = frozenset(keys.joined.values())  # a second policy may have read others
+        found = []
+        for row in worst_moments(first, WORST):
+            episode, step = first.run.moments[row]
+            (moment,) = self._dataset.moments(episode, [step], 1)
+            found.append((row, keys.observation(moment.observation, self._settings.task)))
+        return found
+
     def _prompt(self, observation: Mapping[str, Any]) -> str:
-        about = self._compared[0].run.about
-        return str(observation.get(self._prompt_key, about["default_prompt"]))
+        run = self._compared[0].run
+        return str(observation.get(run.keys.prompt, run.about["default_prompt"]))
 
     def _worst(self, row: int, prompt: str) -> Worst:
         first = self._compared[0]
@@ -155,6 +171,9 @@ class Report:
         yield from self._key_notes
         if dataset.caveat is not None:
             yield dataset.caveat
+        for other in self._compared[1:]:
+            if broken := other.run.broken:
+                yield f"{len(broken)} answers of {other.label} are no chunk; the first: {broken_text(broken[0])}"
         still = [
             name
             for (name, _), unit in zip(names_of(first, dataset.action_names), first.run.units, strict=True)

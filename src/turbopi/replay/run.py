@@ -4,7 +4,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.readings import Checks
 from turbopi.policy.watch import Sample
 from turbopi.preprocess.normalize import Normalizer
+from turbopi.replay.document import Broken
 from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
 from turbopi.replay.keys import KeyMap, join_keys
 from turbopi.support.errors import ActionError, ConfigError, ObservationError
@@ -37,7 +38,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Replayed:
-    """A policy over the moments, N of them.
+    """A policy over the moments that it answered, N of them.
 
     about        its metadata
     keys         how the dataset's keys were read
@@ -53,6 +54,7 @@ class Replayed:
     call_ms      of each call of the policy, a batch's counted once
     variations   {name: float64[n, H, d]}, the chunks of `changed`, indices of moments
     cameras      a few pixels of every moment's images, by the robot's own key
+    broken       the moments whose answer no robot may be given (ActionError), which aren't among the N
     """
 
     about: Mapping[str, Any]
@@ -70,6 +72,19 @@ class Replayed:
     changed: Sequence[int]
     variations: Mapping[str, np.ndarray]
     cameras: Mapping[str, Sequence[Sample]]
+    broken: Sequence[Broken] = ()
+
+    def only(self, rows: Sequence[int]) -> "Replayed":
+        """The same of these of the N moments alone."""
+        kept = [number for number, moment in enumerate(self.changed) if moment in rows]
+        arrays = {name: getattr(self, name)[rows] for name in ("predicted", "recorded", "previous", "middle", "states")}
+        return replace(
+            self,
+            **arrays,
+            moments=[self.moments[row] for row in rows],
+            changed=[rows.index(self.changed[number]) for number in kept],
+            variations={name: chunks[kept] for name, chunks in self.variations.items() if kept},
+        )
 
     @property
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +210,7 @@ class Replay:
         observation = self._observation(self._first)
         rows = BATCH if self.policy.runs_batches else 1
         begin = time.perf_counter()
-        self._infer([observation] * rows, [self.settings.seed] * rows)
+        self._infer([observation] * rows, [self.settings.seed] * rows)  # whether it is broken, `run` says
         return (time.perf_counter() - begin) / rows + self._reading
 
     @property
@@ -204,26 +219,41 @@ class Replay:
         return self.settings.changed * len(self.variations)
 
     def run(self, selection: Selection, advance: Callable[[], None]) -> Replayed:
-        """Every moment of the selection, each with its own noise: the seed's, the seed + 1's, …"""
+        """Every moment of the selection, each with its own noise: the seed's, the seed + 1's, …
+
+        Raises ActionError if no answer is a chunk.
+        """
         count = selection.count
-        changed = sorted({int(i) for i in np.linspace(0, count - 1, min(self.settings.changed, count)).round()})
+        to_change = {int(i) for i in np.linspace(0, count - 1, min(self.settings.changed, count)).round()}
         found: list[_Answer] = []
+        broken: list[Broken] = []
+        changed: list[int] = []
         varied: dict[str, list[np.ndarray]] = {variation.name: [] for variation in self.variations}
         batches = _batches(self._moments(selection), BATCH if self.policy.runs_batches else 1)
         call_ms = []
         for batch in batches:
             observations = [self._observation(moment) for moment in batch]
-            seeds = [self.settings.seed + len(found) + row for row in range(len(batch))]
+            first = len(found) + len(broken)
+            seeds = [self.settings.seed + first + row for row in range(len(batch))]
             with self._naming(batch):
                 begin = time.perf_counter()
                 chunks = self._infer(observations, seeds)
                 call_ms.append((time.perf_counter() - begin) * 1e3)
-                for moment, observation, chunk, seed in zip(batch, observations, chunks, seeds, strict=True):
-                    if len(found) in changed:
-                        for variation in self.variations:
-                            varied[variation.name] += self._infer([variation.change(observation)], [seed])
-                    found.append(self._answer(moment, observation, chunk))
+                for row, (moment, observation, chunk) in enumerate(zip(batch, observations, chunks, strict=True)):
+                    if isinstance(chunk, ActionError):
+                        broken.append(Broken(moment.episode.name, moment.step, str(chunk)))
+                    else:
+                        if first + row in to_change and (own := self._varied(observation, seeds[row])) is not None:
+                            changed.append(len(found))
+                            for variation, other in zip(self.variations, own, strict=True):
+                                varied[variation.name].append(other)
+                        found.append(self._answer(moment, observation, chunk))
                     advance()
+        if not found:
+            raise ActionError(
+                f"{self.dataset.path}: none of the policy's {len(broken)} answers is a chunk that a robot may be "
+                f"given. The first: {broken_text(broken[0])}"
+            )
         return Replayed(
             self.policy.metadata,
             self.keys,
@@ -240,19 +270,15 @@ class Replay:
             changed,
             {name: np.stack(chunks) for name, chunks in varied.items() if chunks},
             _by_camera(found),
+            broken,
         )
-
-    def observation_at(self, episode: Episode, step: int) -> dict[str, Any]:
-        """One moment's observation under the robot's keys, to be looked at."""
-        (moment,) = self.dataset.moments(episode, [step], self.horizon)
-        return self._observation(moment)
 
     @contextmanager
     def _naming(self, batch: Sequence[Moment]) -> Iterator[None]:
         """What the policy can't use is named with where it is."""
         try:
             yield
-        except (ObservationError, ActionError) as error:
+        except ObservationError as error:
             first, more = batch[0], f" and the {len(batch) - 1} after it" if len(batch) > 1 else ""
             where = f"{self.dataset.path}: episode {first.episode.name}, step {first.step}{more}"
             raise type(error)(f"{where}: {error}") from error
@@ -264,12 +290,29 @@ class Replay:
     def _observation(self, moment: Moment) -> dict[str, Any]:
         return self.keys.observation(moment.observation, self.settings.task)
 
-    def _infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[np.ndarray]:
-        if len(observations) == 1:
-            results = [self.policy.infer(observations[0], seed=seeds[0])]
-        else:
-            results = self.policy.infer_batch(observations, seed=seeds)
+    def _infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[np.ndarray | ActionError]:
+        """Each one's chunk, or why its answer is none."""
+        try:
+            if len(observations) == 1:
+                results = [self.policy.infer(observations[0], seed=seeds[0])]
+            else:
+                results = self.policy.infer_batch(observations, seed=seeds)
+        except ActionError as error:
+            if len(observations) == 1:
+                return [error]
+            each = zip(observations, seeds, strict=True)  # the others' are good
+            return [self._infer([observation], [seed])[0] for observation, seed in each]
         return [result["actions"][:, : self.width] for result in results]
+
+    def _varied(self, observation: Mapping[str, Any], seed: int) -> list[np.ndarray] | None:
+        """The chunk with each variation of the inputs; None if one of them is none."""
+        chunks = []
+        for variation in self.variations:
+            (chunk,) = self._infer([variation.change(observation)], [seed])
+            if isinstance(chunk, ActionError):
+                return None
+            chunks.append(chunk)
+        return chunks
 
     def _answer(self, moment: Moment, observation: Mapping[str, Any], chunk: np.ndarray) -> "_Answer":
         pipeline, model = self.policy.pipeline, self.policy.config.model
@@ -310,6 +353,11 @@ class _Answer:
     middle: np.ndarray
     state: np.ndarray
     images: Mapping[str, Sample]
+
+
+def broken_text(one: Broken) -> str:
+    """Where it is, and why."""
+    return f"episode {one.episode}, step {one.step}: {one.why}"
 
 
 def _by_camera(answers: Sequence[_Answer]) -> dict[str, list[Sample]]:

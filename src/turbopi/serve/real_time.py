@@ -26,8 +26,8 @@ from turbopi.realtime.messages import (
     keeps_episode,
     read_message,
 )
-from turbopi.realtime.queue import default_execution_horizon
-from turbopi.realtime.running_chunk import JoinMode, RunningChunk
+from turbopi.realtime.queue import default_execution_horizon, longest_delay
+from turbopi.realtime.running_chunk import JoinMode, RunningChunk, refuses_guidance
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import ConfigError, ObservationError
@@ -172,6 +172,9 @@ class RealTime:
         mode = requested.mode or self._options.execution
         if mode is not None and mode not in self._modes:
             raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
+        guidance = {PREFIX + name: value for name, value in (requested.guidance or {}).items()}
+        if mode is not None and (why := refuses_guidance(mode, guidance)) is not None:
+            raise ObservationError(why)
         if requested.session is None and (requested.previous is not None or requested.model_actions):
             if not self._remembers and (requested.step is not None or requested.reset):
                 raise ObservationError(
@@ -438,6 +441,26 @@ def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon:
     if s is not None and horizon is not None and s > horizon:
         raise ConfigError(
             f"execution_horizon={s} was asked for, but this policy's chunks have {horizon} actions: give at most that"
+        )
+    if options.delay_steps is not None:
+        _check_delay(options, options.delay_steps, offered, horizon)
+
+
+def _check_delay(options: ServerOptions, delay: int, offered: Mapping[str, Any], horizon: int | None) -> None:
+    """Raise ConfigError for a delay that would be cut in every call."""
+    trained = int(offered.get("trained_max_delay") or 0)
+    if options.execution == "rtc_trained" and delay > trained:
+        raise ConfigError(
+            f"delay_steps={delay} was asked for, but this checkpoint was trained with delays up to {trained}: give at "
+            "most that, or execution='rtc'"
+        )
+    if horizon is None:
+        return
+    s = options.execution_horizon or default_execution_horizon(horizon)
+    if delay > (most := longest_delay(horizon, s)):
+        raise ConfigError(
+            f"delay_steps={delay} was asked for, but with chunks of {horizon} actions and an execution horizon of {s} "
+            f"at most {most} control steps fit: give at most that, another execution_horizon=, or a lower control rate"
         )
 
 

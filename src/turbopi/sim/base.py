@@ -50,11 +50,11 @@ class SimSettings:
 
     def __post_init__(self) -> None:
         if self.seeding not in ("episode", "task"):
-            raise ConfigError(f"seeding is {self.seeding!r}; choose episode or task")
+            raise ConfigError(f"seeding={self.seeding!r} isn't one; choose episode or task")
         for name, least, most in (("seed", 0, 2**32 - 1), ("wait_steps", 0, 1000), ("camera_px", 16, MAX_PX)):
             value = getattr(self, name)
             if not least <= value <= most:
-                raise ConfigError(f"{name} is {value}; it should be from {least} to {most}")
+                raise ConfigError(f"{name}={value} should be from {least} to {most}")
 
     def episode_seed(self, task: int, initial_state: int) -> int:
         """What the environment's random generator is seeded with: 32 bits."""

@@ -1,5 +1,6 @@
 """Images of action chunks, as PNG files, and the colours of all plots: one colour for one thing."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +98,9 @@ def write_figure(file: Path, figure: Figure, dpi: int = _DPI, *, about: Mapping[
     """
     try:
         kind = file.suffix.removeprefix(".") or "png"
-        write_whole(file, lambda stream: figure.savefig(stream, dpi=dpi, format=kind, metadata=about))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # a prompt's: it is drawn as a box
+            write_whole(file, lambda stream: figure.savefig(stream, dpi=dpi, format=kind, metadata=about))
     except ValueError as error:
         raise ConfigError(f"can't write the plot {file}: {error}") from error
 

@@ -111,15 +111,11 @@ class ServedModel:
                     end = min(join.end, left)
                     known = model_actions[first : first + left].copy()
                     known[:, actions.shape[1] :] = 0
-                    return RunningChunk(
-                        known,
-                        min(join.delay, left if join.mode == "rtc_trained" else end),
-                        None if join.mode == "rtc_trained" else len(actions) - end,
-                        join.mode,
-                        anchor,
-                        join.schedule,
-                        join.max_guidance_weight,
-                    )
+                    if join.mode == "rtc_trained":
+                        return RunningChunk(known, min(join.delay, left), None, join.mode, anchor)
+                    guidance = join.schedule, join.max_guidance_weight
+                    s = len(actions) - end
+                    return RunningChunk(known, min(join.delay, end), s, join.mode, anchor, *guidance)
         raise ObservationError(
             "prev_chunk_left_over has rows that the server's last answers don't have: give rows of what "
             "predict_action_chunk returned, as they are"
