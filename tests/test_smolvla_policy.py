@@ -1,12 +1,14 @@
 """SmolVLA through `UnifiedPolicy`, from checkpoint folders as LeRobot writes them, against what LeRobot computed."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from checkpoint_helpers import edit_json, write_json
 from cli_helpers import turbopi
 from smolvla_golden import COMMIT, GOLDEN, GoldenRuns, make_aloha, make_checkpoint, make_hub, relative
 
@@ -14,6 +16,8 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.fused_smolvla import FusedSmolVLABackend
 from turbopi.checkpoint import open_checkpoint
+from turbopi.checkpoint.vision_positions import shifted_rows
+from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.preprocess.images import fit_unit, fitted
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, TokenizerError
@@ -139,7 +143,7 @@ def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: py
         ({"adapt_to_pi_aloha": True}, "for 14 joints and grippers, but the state has 6 values and an action 6"),
         ({"resize_imgs_with_padding": [512, 384]}, r"resize_imgs_with_padding = \[512, 384\]"),
         ({"resize_imgs_with_padding": None}, "resize_imgs_with_padding = None"),
-        ({"num_vlm_layers": 0}, "num_vlm_layers is 0"),
+        ({"num_vlm_layers": 0}, r"missing .*text_model\.layers\.4\."),  # all six of the vision-language model's
         ({"num_expert_layers": 3}, "3 layers of the expert don't go into 4 text layers"),
     ],
 )
@@ -150,6 +154,90 @@ def test_what_is_not_computed_is_refused_by_its_key(
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | change))
     with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+def test_as_many_text_layers_as_there_are_is_what_no_number_of_them_means(hub: Path, tmp_path: Path) -> None:
+    """LeRobot cuts the vision-language model's layers only where num_vlm_layers says fewer, above 0."""
+    vlm = tmp_path / "vlm"
+    shutil.copytree(hub / "models--HuggingFaceTB--SmolVLM2-500M-Video-Instruct/snapshots" / COMMIT, vlm)
+    edit_json(vlm / "config.json", lambda config: config["text_config"].update(num_hidden_layers=4))
+    for number in (-1, 0, 9):
+        folder = make_checkpoint("base", tmp_path / str(number))
+        write_json(folder / "turbopi.json", {"vlm": str(vlm)})
+        edit_json(folder / "config.json", lambda config, number=number: config.update(num_vlm_layers=number))
+        model = open_checkpoint(folder).config.model
+        assert isinstance(model, SmolVLAConfig)
+        assert model.text.depth == 4
+
+
+OLD = ("pretrained_revision", "compile_model", "compile_mode", "rtc_config", "use_peft")  # keys since 0.6, …, 0.4.3
+
+
+def written_by(folder: Path, version: str) -> Path:
+    """golden `base` as an older LeRobot writes it."""
+    make_checkpoint("base", folder)
+    for key in OLD if version < "0.4.3" else OLD[:1]:
+        edit_json(folder / "config.json", lambda config, key=key: config.pop(key))
+    return folder
+
+
+def test_actions_are_those_of_the_lerobot_that_wrote_the_files(hub: Path, tmp_path: Path) -> None:
+    golden, theirs = GoldenRuns("base"), np.load(GOLDEN / "base/lerobot_0.4.npz")
+
+    def error(folder: Path, key: str, **settings: str) -> float:
+        write_json(folder / "turbopi.json", settings)
+        policy = UnifiedPolicy(folder, precision="f32")
+        return relative(policy.infer(golden.observation(3), noise=golden.noise)["actions"], theirs[key])
+
+    first = written_by(tmp_path / "first", "0.4.0")
+    assert error(first, "0.4.0") <= 3e-6
+    assert error(first, "0.4.0", lerobot_semantics="0.6") > 1e-5  # t is rounded otherwise
+    last = written_by(tmp_path / "last", "0.4.4")
+    assert error(last, "0.4.4", vision_positions="shifted") <= 3e-6
+    assert error(last, "0.4.4") > 1e-1
+
+
+def test_positions_that_no_file_tells_are_noted(folders: Path, hub: Path, tmp_path: Path) -> None:
+    def noted(folder: Path) -> bool:
+        return any("one row and one column too early" in note for note in open_checkpoint(folder).source.notes)
+
+    folder = written_by(tmp_path / "old", "0.4.4")
+    assert noted(folder)
+    assert not noted(folders / "base" / "checkpoint")  # 0.6 wrote it
+    plain = open_checkpoint(folder).fingerprint()
+    for choice in ("exact", "shifted"):
+        write_json(folder / "turbopi.json", {"vision_positions": choice})
+        assert not noted(folder)
+        assert (open_checkpoint(folder).fingerprint() == plain) == (choice == "exact")
+    for change, message in (
+        ({"resize_imgs_with_padding": [160, 160]}, "the table of positions has, 16, but an image has 20"),
+        ({"load_vlm_weights": True}, "in a bfloat16 vision tower no version"),
+    ):
+        edit_json(folder / "config.json", lambda config, change=change: config.update(change))
+        with pytest.raises(ConfigError, match=message):
+            open_checkpoint(folder)
+
+
+@pytest.mark.parametrize(("patches", "taken"), [(4, [0, 0, 1, 2]), (2, [0, 1]), (3, [0, 1, 2])])
+def test_positions_are_shifted_as_they_were(patches: int, taken: list[int]) -> None:
+    """A table of four rows: what those versions of transformers took of it."""
+    rows = shifted_rows(4, patches)
+    assert [int(rows[i * 4 // patches]) for i in range(patches)] == taken
+
+
+def test_a_folder_of_before_0_4_is_to_be_migrated(folders: Path, hub: Path, tmp_path: Path) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    folder = written_by(tmp_path / "old", "0.3")
+    for file in folder.glob("policy_*"):
+        file.unlink()
+    with pytest.raises(CheckpointError, match="is the download complete"):
+        open_checkpoint(folder)
+    weights = load_file(folder / "model.safetensors")
+    statistics = {"unnormalize_outputs.buffer_action.mean": np.zeros(6, np.float32)}
+    save_file(weights | statistics, folder / "model.safetensors")
+    with pytest.raises(CheckpointError, match=f"migrate_policy_normalization --pretrained-path {folder}"):
         open_checkpoint(folder)
 
 

@@ -30,6 +30,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
 from turbopi.checkpoint.names import Names, PiNames
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
+from turbopi.checkpoint.source import WeightSource
 from turbopi.config import (
     LIMITS,
     MOST_REMEMBERED,
@@ -37,6 +38,7 @@ from turbopi.config import (
     Kind,
     MemoryConfig,
     ModelConfig,
+    Network,
     Normalization,
     NormMode,
     PolicyConfig,
@@ -84,6 +86,7 @@ class LeRobotFolder:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
         self.config = Fields(_read_config(folder), self.file)
         self.kind = self._check_config()
+        versions.check_migrated(folder, folder / PREPROCESSOR)
         self.memory = self._memory()
         # LeRobot trains it without the state in the prompt, and doesn't save that: a folder that it loads has it again
         state_tokens = self.memory is not None and self.memory.proprioceptive
@@ -230,6 +233,10 @@ class LeRobotFolder:
                 f"{meaning}. Run this checkpoint with LeRobot's own policy"
             )
         return family.kind
+
+    def weights(self, source: WeightSource, network: Network) -> WeightSource:
+        """`source`, or one that reads it as turbopi.json says."""
+        return source
 
     def _check_family(self, family: Family) -> None:
         if "resize_imgs_with_padding" in self.config.values:

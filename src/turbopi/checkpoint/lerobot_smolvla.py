@@ -6,24 +6,27 @@ published models, from what is known of them. The tensors must fit what it says.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
+from turbopi.checkpoint import lerobot_versions as versions
 from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
-from turbopi.config import LIMITS, Normalization, PolicyConfig
+from turbopi.checkpoint.source import WeightSource
+from turbopi.checkpoint.vision_positions import SHIFTED, ShiftedPositions
+from turbopi.config import LIMITS, Network, Normalization, PolicyConfig, TimeRounding
 from turbopi.models import Family
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
 from turbopi.models.smolvla.names import canonical_name, native_name
-from turbopi.support.errors import CheckpointError
+from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.hub_cache import hub_folder
 from turbopi.support.reading import Fields, read_json, shown
 
 _VLM = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 _COUNTS = {  # keys, and the limits of turbopi.config for them
-    "num_vlm_layers": "depth",
     "chunk_size": "action_horizon",
     "tokenizer_max_length": "max_prompt_tokens",
     "max_state_dim": "action_dim",
@@ -31,6 +34,13 @@ _COUNTS = {  # keys, and the limits of turbopi.config for them
 }
 ALOHA_JOINTS = 14
 _TOKENIZER, _TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
+
+
+@dataclass(frozen=True)
+class SummedTimes(SmolVLAConfig):
+    """Of LeRobot 0.4.0 to 0.4.2."""
+
+    time_grid: ClassVar[TimeRounding] = "accumulated"
 
 
 class SmolVLANames:
@@ -50,12 +60,13 @@ class SmolVLAFolder(LeRobotFolder):
     """As `LeRobotFolder`. vlm_source: where the vision-language model's sizes are from, for messages."""
 
     keys: ClassVar[Keys] = SMOLVLA
-    own_settings: ClassVar[frozenset[str]] = frozenset({"vlm"})
+    own_settings: ClassVar[frozenset[str]] = frozenset({"vlm", "vision_positions"})
 
     @classmethod
     def names(cls, folder: Path) -> Names:
         config = Fields(read_json(folder / CONFIG), folder / CONFIG)
-        return SmolVLANames(config.integer("num_vlm_layers", 1, LIMITS["depth"], default=16))
+        depth = config.integer("num_vlm_layers", -LIMITS["depth"], LIMITS["depth"], default=16)
+        return SmolVLANames(depth if depth > 0 else LIMITS["depth"])
 
     def _described(self) -> PolicyConfig:
         return PolicyConfig(
@@ -123,7 +134,16 @@ class SmolVLAFolder(LeRobotFolder):
         return str(self.config.object("normalization_mapping", {}).values.get(kind, "IDENTITY"))
 
     def _notes_on_version(self) -> list[str]:
-        return []  # the same in all of them, from floats or bytes in [0, 1]
+        """The rounding of t aside, LeRobot's versions differ by the transformers that they ran with."""
+        unsure = versions.may_have_shifted_positions(self.config.values)
+        if not unsure or "vision_positions" in self.settings.values or self.config.flag("load_vlm_weights", False):
+            return []
+        return [
+            "positions of image patches are LeRobot 0.5's and later. LeRobot 0.4 with transformers 4.55 to 4.57 took "
+            "them one row and one column too early in a float32 vision tower such as this one, and no file tells "
+            'whether it did: {"vision_positions": "shifted"} in a turbopi.json computes that, "exact" what is computed '
+            "now"
+        ]
 
     def _check_family(self, family: Family) -> None:
         size = self.config.values.get("resize_imgs_with_padding", [512, 512])
@@ -136,7 +156,7 @@ class SmolVLAFolder(LeRobotFolder):
         given = self.config.values.keys()
         for key in given & _COUNTS.keys():
             self.config.integer(key, 1, LIMITS[_COUNTS[key]])
-        for key in given & {"num_expert_layers", "prefix_length", "self_attn_every_n_layers"}:
+        for key in given & {"num_vlm_layers", "num_expert_layers", "prefix_length", "self_attn_every_n_layers"}:
             self.config.integer(key, -1, LIMITS["max_prompt_tokens"])
         for key in given & {"min_period", "max_period", "expert_width_multiplier"}:
             self.config.number(key, 1e-6, 1e6)
@@ -147,7 +167,8 @@ class SmolVLAFolder(LeRobotFolder):
     def _network(self) -> SmolVLAConfig:
         vlm, source = self._vlm()
         try:
-            network = from_lerobot(self.config.values, {**vlm, **self._special_tokens()})
+            depth = _depth(self.config.values, vlm["text_config"])
+            network = from_lerobot({**self.config.values, "num_vlm_layers": depth}, {**vlm, **self._special_tokens()})
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise CheckpointError(
                 f"{source} isn't a config of a SmolVLM: {type(error).__name__} at {error}; expected its "
@@ -156,7 +177,22 @@ class SmolVLAFolder(LeRobotFolder):
         problem = _problem(network)
         if problem is not None:
             raise CheckpointError(f"{self.file} with the sizes of {source}: {problem}; LeRobot can't run it either")
+        if versions.smolvla_sums_up_time(self.config.values) and self.settings.values.get("lerobot_semantics") != "0.6":
+            return SummedTimes(**{one.name: getattr(network, one.name) for one in fields(network)})
         return network
+
+    def weights(self, source: WeightSource, network: Network) -> WeightSource:
+        if self.settings.values.get("vision_positions") != SHIFTED or not isinstance(network, SmolVLAConfig):
+            return source
+        if network.element_types.vision == "bfloat16":
+            raise ConfigError(
+                f"{self.settings.source}: vision_positions is {SHIFTED!r}, but {self.file} has load_vlm_weights = "
+                "true: in a bfloat16 vision tower no version of transformers shifted them"
+            )
+        patch = network.vision.patch_size
+        return ShiftedPositions(
+            source, network.vision.image_size // patch, network.image_size // patch, self.settings.source
+        )
 
     def _vlm(self) -> tuple[Mapping[str, Any], str]:
         """The vision-language model's config, and where it is from."""
@@ -199,6 +235,13 @@ class SmolVLAFolder(LeRobotFolder):
                 raise CheckpointError(f"{folder / _TOKENIZER} has no tokens {around} and {whole} among added_tokens")
             return {"image_start_token_ids": (first, second), "image_end_token_ids": (first,)}
         return {}
+
+
+def _depth(config: Mapping[str, Any], text: Mapping[str, Any]) -> int:
+    """Text layers that the network has: all that there are where LeRobot's number is 0 or less, never more."""
+    depth: int = config.get("num_vlm_layers", 16)
+    there: int = text.get("num_hidden_layers", 32)  # a Llama's, and the published model's
+    return min(depth, there) if depth > 0 else there
 
 
 def _problem(network: SmolVLAConfig) -> str | None:

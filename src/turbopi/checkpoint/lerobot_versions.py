@@ -5,7 +5,7 @@
     0.4.3, 0.4.4    the state, and zeros up to 32       -3           1 + step * dt
     0.5.0 - 0.6.1   the state as wide as it is          -1           1 + step * dt
 
-The prompt of Pi0 has no state in any of them, the rest is as Pi0.5's.
+The prompt of Pi0 has no state in any of them, the rest is as Pi0.5's. SmolVLA's t alone differs, as theirs.
 
 No file holds a version. But LeRobot writes every field of its config, and has added some: `freeze_vision_encoder` in
 0.4.3, `use_relative_actions` in 0.5.1. The config of 0.5.0 is that of 0.4.4, but 0.4 ties lm_head to the embedding and
@@ -13,15 +13,24 @@ stores one of them, 0.5 stores both. Sources: LeRobot's `policies/pi0` and `poli
 """
 
 from collections.abc import Collection
+from pathlib import Path
 from typing import Literal
+
+from turbopi.checkpoint.torch_files import WEIGHTS, read_header
+from turbopi.support.errors import CheckpointError
 
 Semantics = Literal["0.4", "0.6"]  # 0.6 is 0.5, too
 
-# what 0.4.0 writes into config.json, and every later one
+_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+# what 0.4.0 writes into config.json, and every later one: of any policy, and of Pi0 and Pi0.5
+_OF_ANY = {
+    *("type", "n_obs_steps", "input_features", "output_features", "device", "use_amp", "push_to_hub", "repo_id"),
+    *("private", "tags", "license", "pretrained_path"),
+}
 FIRST_KEYS = frozenset(
     {
-        *("type", "n_obs_steps", "input_features", "output_features", "device", "use_amp", "push_to_hub", "repo_id"),
-        *("private", "tags", "license", "pretrained_path", "paligemma_variant", "action_expert_variant", "dtype"),
+        *_OF_ANY,
+        *("paligemma_variant", "action_expert_variant", "dtype"),
         *("chunk_size", "n_action_steps", "max_state_dim", "max_action_dim", "num_inference_steps"),
         *("time_sampling_beta_alpha", "time_sampling_beta_beta", "time_sampling_scale", "time_sampling_offset"),
         *("min_period", "max_period", "image_resolution", "empty_cameras", "tokenizer_max_length"),
@@ -47,6 +56,30 @@ def detect(keys: Collection[str], *, untied: bool) -> Semantics | None:
 def sums_up_time(keys: Collection[str]) -> bool:
     """Whether it was 0.4.0 to 0.4.2."""
     return set(keys) >= FIRST_KEYS and "freeze_vision_encoder" not in keys
+
+
+def smolvla_sums_up_time(keys: Collection[str]) -> bool:
+    """Whether a SmolVLA is of 0.4.0 to 0.4.2: `use_peft` is of 0.4.3."""
+    return set(keys) >= _OF_ANY and "use_peft" not in keys
+
+
+def may_have_shifted_positions(keys: Collection[str]) -> bool:
+    """Whether a SmolVLA may be of 0.4, see vision_positions.py: no key is of 0.5, `pretrained_revision` is of 0.6."""
+    return "pretrained_revision" not in keys
+
+
+def check_migrated(folder: Path, preprocessor: Path) -> None:
+    """CheckpointError for a folder of before 0.4, whose statistics are among the weights."""
+    weights = folder / WEIGHTS
+    if preprocessor.exists() or not weights.is_file():
+        return
+    if any(stored.key.startswith(_STATISTICS) for stored in read_header(weights)):
+        raise CheckpointError(
+            f"{folder} is of a LeRobot before 0.4: its statistics are among the weights, and it has no processors. "
+            "LeRobot 0.4 and later don't read it either. Once, in LeRobot's environment: python -m "
+            f"lerobot.processor.migrate_policy_normalization --pretrained-path {folder}. Then give the folder that "
+            "this writes, whose name ends in _migrated"
+        )
 
 
 def note(done: Semantics, written_by: Semantics | None, prompt_width: int) -> str:

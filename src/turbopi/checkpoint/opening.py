@@ -218,6 +218,7 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
     source, chosen = _with_target_time(source, folder.policy_config(), settings, location)
     policy = _with_sizes(chosen, source, settings, location)
     _check_type(policy.model.kind, folder)
+    source = folder.weights(source, policy.model)
     source.notes.extend(folder.notes())
     source.notes += notes_on_settings(
         location.folder,

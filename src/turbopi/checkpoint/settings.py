@@ -40,6 +40,7 @@ itself.
                           of Pi0-FAST alone: folder of the action tokenizer, relative to this file; tokens of an answer,
                           1 to 1000; "refuse", or "owners" for what the owner's code makes of an answer that is broken
     vlm                   of SmolVLA alone: folder of the vision-language model's config.json, relative to this file
+    vision_positions      of SmolVLA alone: "exact", or "shifted" as by transformers 4.55 to 4.57: vision_positions.py
     weights_sha256        what `turbopi inspect --hash` shows of these weights: others are refused at loading
 
 Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
@@ -87,6 +88,7 @@ ABOUT_WEIGHTS = {
     "weights_sha256",
     "lerobot_semantics",
     "target_time",
+    "vision_positions",
 }  # keys of a .json
 ConfigSource = str | Path | PolicyConfig
 
@@ -435,6 +437,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "lora_rslora": ("true or false", _flag),
     "base_model": ("a folder", _text),
     "vlm": ("a folder", _text),
+    "vision_positions": ("'exact' or 'shifted'", _choice("exact", "shifted")),
     "action_tokenizer": ("a folder", _text),
     "max_decoding_steps": _count(LIMITS["max_decoding_steps"]),
     "broken_answers": ("'refuse' or 'owners'", _choice("refuse", "owners")),
