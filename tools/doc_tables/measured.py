@@ -5,9 +5,10 @@ from pathlib import Path
 
 from msgspec import Struct
 from msgspec.structs import replace
+from packed import read_packed
 
 from doc_tables.results import RESULTS
-from turbopi.bench.document import Result, Times, read_benchmark
+from turbopi.bench.document import BenchDocument, Result, Times
 from turbopi.bench.measured import Kernels, MeasuredCall
 from turbopi.bench.predict import STAGES
 from turbopi.bench.work import Job
@@ -66,7 +67,7 @@ def measured(root: Path) -> str:
     """The text of data/measured_calls.json; a later file's calls replace an earlier one's of the same kind and job."""
     calls: dict[tuple[object, ...], MeasuredCall] = {}
     for source in _sources(root):
-        document = read_benchmark(root / RESULTS / source.file)
+        document = read_packed(root / RESULTS / source.file, BenchDocument)
         for result in document.results:
             if result.backend in source.kernels and _wanted(result):
                 call = _call(result, source)

@@ -220,20 +220,6 @@ def machine(document: BenchDocument) -> list[str]:
     ]
 
 
-def image_sizes(document: BenchDocument) -> list[str]:
-    """The main job with images as cameras send them: the whole call's median, and how much longer than 224 x 224."""
-    main, rows = document.main_job, []
-    sizes = list(dict.fromkeys((result.job.image_width, result.job.image_height) for result in document.results))
-    for backend, precision in dict.fromkeys((result.backend, result.precision) for result in document.results):
-        found = [_result(document, backend, precision, image_width=w, image_height=h) for w, h in sizes]
-        first = _result(document, backend, precision)
-        assert first is not None and all(found), f"{backend} {precision} lacks a size of {main}"
-        calls = [one.milliseconds["total"].p50 for one in found if one is not None]
-        more = [call - first.milliseconds["total"].p50 for call in calls]
-        rows.append([f"`{backend}` {precision}", *(f"{c:.2f} (+{m:.2f})" for c, m in zip(calls, more, strict=True))])
-    return _table(["", *(f"{width} × {height}" for width, height in sizes)], rows)
-
-
 def layer_in_cycles(marks: list[MarkedVariant]) -> list[str]:
     """Where a warp's cycles of a layer go: means over ranks, and a bar a phase for each form's first run in FP8.
 
@@ -318,7 +304,7 @@ def _read_marks(file: Path) -> list[MarkedVariant]:
 
 
 _OF_BENCHMARKS = (
-    *(headline, main_job, whole_calls, image_sizes, joins, batches),
+    *(headline, main_job, whole_calls, joins, batches),
     *(errors, ready, kernels, machine),
 )
 TABLES = {

@@ -27,7 +27,7 @@ from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditionings, Form
 
 # Milliseconds of vision, prefix and denoising of a call for so many observations of two images, and what `fused`
-# splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.
+# splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.xz.
 GPUS: dict[str, tuple[dict[int, tuple[float, float, float]], dict[int, float]]] = {
     "h100_bf16": (
         {1: (1.27, 3.4, 3.0), 2: (2.38, 6.67, 3.55), 4: (3.79, 12.76, 5.73), 8: (7.37, 23.83, 6.95)},

@@ -6,8 +6,8 @@ An observation is three kinds of graph for so many cameras: "vision", "prefix", 
 one evaluation of the expert. The loop around the steps is the reference's own (`integrate`), so it takes whatever that
 does but gradients. Images are resized on the device.
 
-Several observations are the same graphs with a row for each: cameras that an observation hasn't are masked. Those that
-aren't plain (`Conditioning.form`) run alone.
+Several observations are the same graphs with a row for each, for backends of `runs_batches`: cameras that an
+observation hasn't are masked. Those that aren't plain (`Conditioning.form`) run alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
