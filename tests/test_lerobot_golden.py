@@ -85,8 +85,7 @@ def test_running_chunks_are_joined_as_lerobot_joins_its_left_overs(tmp_path: Pat
                 None if trained else 10 - end,
                 "rtc_trained" if trained else "rtc_identity",
                 anchor,
-                SCHEDULES[run["schedule"]],
-                10.0,
+                *(() if trained else (SCHEDULES[run["schedule"]], 10.0)),
             )
             actions = policy.infer(observation, noise=inputs["noise"], previous=previous)["actions"]
             np.testing.assert_allclose(actions, stored[f"{index}/actions"], atol=1e-5, err_msg=str(run))

@@ -111,7 +111,8 @@ def simulate(schedule: Schedule, arrivals: Sequence[Request]) -> History:
         refuse(decision.refused)
         if decision.turn:
             rows = sum(one.rows for one in decision.turn)
-            ends = now + schedule.times.total(rows, now)
+            formed = schedule.times.seconds(rows, now) if rows <= schedule.times.formed_largest(now) else None
+            ends = now + (schedule.times.total(rows, now) if formed is None else formed)
             history.turns.append(Turn(decision.turn, now, ends, tuple(schedule._waiting), now < schedule.crowded_until))
         wake = math.inf if decision.wake is None else decision.wake
     raise AssertionError("it never ends")
@@ -750,6 +751,22 @@ def test_a_late_timer_does_not_shrink_the_batch_that_was_waited_for() -> None:
     sent.append(request(wake, source=3))
     assert not schedule.add(sent[-1], wake)
     assert begin(schedule, wake + 0.9 * LATE_TIMER) == sent, "four take 22 ms, and the first three had 24.5"
+
+
+def test_who_waited_in_vain_is_in_time() -> None:
+    """Three of 10, 14 and 22 ms (by size) as they pay most, two and one, take 24 ms; the wait left room for 22."""
+    schedule = Schedule(16, table(PAYING))
+    now = cohort(schedule, apart=0.001)
+    sent = [request(now, source=robot, within=0.0245) for robot in range(3)]
+    for one in sent:
+        assert not schedule.add(one, now)
+    wake = schedule.decide(now).wake
+    assert wake is not None and now + 0.0005 < wake < now + 0.0025
+    assert begin(schedule, wake) == sent
+    loose = Schedule(16, table(PAYING))
+    for one in [request(0.0, source=robot, within=0.025) for robot in range(3)]:
+        loose.add(one, 0.0)
+    assert len(begin(loose, 0.0)) == 2
 
 
 def test_company_that_does_not_come_is_waited_for_a_few_gaps_alone() -> None:

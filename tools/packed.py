@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from msgspec import Struct
 
+from turbopi.bench.document import BenchDocument, as_benchmark
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import as_document, read_document
 
@@ -27,3 +28,8 @@ def read_packed(file: Path, kind: type[T]) -> T:
     if file.suffix != ".xz":
         return read_document(file, kind, ConfigError)
     return as_document(json.loads(content_of(file)), kind, str(file))
+
+
+def read_packed_benchmark(file: Path) -> BenchDocument:
+    """Raises ConfigError as `read_benchmark`."""
+    return as_benchmark(json.loads(content_of(file)), file)

@@ -6,8 +6,9 @@ from pathlib import Path
 from doc_tables import peers
 from doc_tables.measured import kernels_of
 from doc_tables.results import RESULTS, result_files
+from packed import read_packed_benchmark
 
-from turbopi.bench.document import BenchDocument, read_benchmark
+from turbopi.bench.document import BenchDocument
 from turbopi.support.errors import ConfigError
 from turbopi.support.text import significant
 
@@ -51,9 +52,9 @@ def _link(root: Path, file: Path) -> str:
 
 def _ours(root: Path) -> Iterator[list[str]]:
     kernels = kernels_of(root)
-    for file in sorted((root / RESULTS).rglob("*.json")):
+    for file in sorted(file for end in ("json", "json.xz") for file in (root / RESULTS).rglob(f"*.{end}")):
         try:
-            document = read_benchmark(file)
+            document = read_packed_benchmark(file)
         except ConfigError:
             continue  # another kind of result
         portable = "portable" in kernels.get(file.relative_to(root / RESULTS).as_posix(), {}).values()

@@ -5,10 +5,10 @@ from pathlib import Path
 
 from msgspec import Struct
 from msgspec.structs import replace
-from packed import read_packed
+from packed import read_packed_benchmark
 
 from doc_tables.results import RESULTS
-from turbopi.bench.document import BenchDocument, Result, Times
+from turbopi.bench.document import Result, Times
 from turbopi.bench.measured import Kernels, MeasuredCall
 from turbopi.bench.predict import STAGES
 from turbopi.bench.work import Job
@@ -67,7 +67,7 @@ def measured(root: Path) -> str:
     """The text of data/measured_calls.json; a later file's calls replace an earlier one's of the same kind and job."""
     calls: dict[tuple[object, ...], MeasuredCall] = {}
     for source in _sources(root):
-        document = read_packed(root / RESULTS / source.file, BenchDocument)
+        document = read_packed_benchmark(root / RESULTS / source.file)
         for result in document.results:
             if result.backend in source.kernels and _wanted(result):
                 call = _call(result, source)

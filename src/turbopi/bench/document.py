@@ -185,7 +185,11 @@ def all_steps(results: Sequence[Result]) -> list[int]:
 
 def read_benchmark(file: Path) -> BenchDocument:
     """Raises ConfigError, naming file and key, for a file that is none."""
-    content = read_json(file, ConfigError, limit=MAX_BYTES)
+    return as_benchmark(read_json(file, ConfigError, limit=MAX_BYTES), file)
+
+
+def as_benchmark(content: Mapping[str, object], file: Path) -> BenchDocument:
+    """What is in a file, as `read_benchmark`."""
     if "floors" not in content:
         raise ConfigError(f"{file} holds no benchmark; expected the results.json of `turbopi bench --report`")
     return as_document(content, BenchDocument, file, ConfigError)

@@ -26,6 +26,7 @@ import math
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
+from itertools import accumulate
 from operator import attrgetter
 from statistics import median
 from typing import Any, Literal
@@ -457,7 +458,9 @@ class Schedule:
         if len(group) == 1:
             return tuple(group)
         rows = sum(request.rows for request in group)
-        best = self._times(group).best(rows, now, self._longest(group, now))
+        longest = self._longest(group, now)
+        late = self._late_unless_together(group, rows, now, longest)
+        best = rows if late else self._times(group).best(rows, now, longest)
         turn, taken = [group[0]], group[0].rows
         for request in group[1:]:
             if taken + request.rows > best:
@@ -465,6 +468,17 @@ class Schedule:
             turn.append(request)
             taken += request.rows
         return tuple(turn)
+
+    def _late_unless_together(self, group: list[Request], rows: int, now: float, longest: float) -> bool:
+        """Whether all in one run are in time, and in the runs that pay most they aren't: a wait leaves room for one."""
+        times, first = self._times(group), min(request.deadline for request in group)
+        if now + times.total(rows, now) <= first or rows > times.formed_largest(now):
+            return False
+        together = times.seconds(rows, now)
+        if together is None or together > min(longest, first - now):
+            return False
+        ahead = accumulate(request.rows for request in group)
+        return any(now + times.total(done, now) > one.deadline for done, one in zip(ahead, group, strict=True))
 
     def _longest(self, group: Iterable[Request], now: float) -> float:
         """Seconds that a batch may take: for the deadlines in it, and for a robot whose request may come while it runs.
