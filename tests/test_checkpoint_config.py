@@ -243,9 +243,12 @@ def test_a_turbopi_json_that_config_replaces_is_a_note_where_it_differs(tmp_path
     folder = torch_copy(tmp_path / "c", action_horizon=25, weights_sha256="0" * 64)
     given = tmp_path / "given.json"
     (folder / "config.json").unlink()
-    write_json(given, {"preset": "pi05_libero", "vision_heads": 4})
+    write_json(given, {"preset": "pi05_libero", "vision_heads": 4, "real_time": {"schedule": "linear"}})
     (note,) = open_checkpoint(folder, given).source.notes
-    assert f"turbopi.json isn't read: {given} replaces it. It says action_horizon = 25 (used: 10)" in note
+    assert (
+        f"turbopi.json isn't read: {given} replaces it. With it: " in note and "action_horizon = 25 (used: 10)" in note
+    )
+    assert "real_time.schedule = 'exponential' (used: 'linear')" in note
     assert "weights_sha256 = '0000" in note and "vision_heads" not in note
     assert open_checkpoint(folder, folder / "turbopi.json").source.notes == []  # the file itself
     write_json(given, json.loads((folder / "turbopi.json").read_text()))

@@ -5,12 +5,13 @@ turbopi.json   `config=` replaces it.
 """
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 from turbopi.checkpoint.settings import ABOUT_WEIGHTS, FILE_NAME, Settings, read_settings, values_of
 from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import WeightSource, listing
-from turbopi.config import GemmaConfig, PolicyConfig
+from turbopi.config import GemmaConfig, PolicyConfig, RealTime
 from turbopi.models import family_of
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import read_json, shown
@@ -80,9 +81,10 @@ def notes_on_settings(
         return [f"{unread}. By itself it is refused: {error}"]
     ours = values_of(policy)
     others = [
-        f"{key} = {shown(value)} (used: {shown(ours[key])})"
-        for key, value in theirs.items()
-        if key != "name" and value != ours[key]
+        f"{name} = {shown(value)} (used: {shown(used)})"
+        for key, all_of_it in theirs.items()
+        if key != "name"
+        for name, value, used in _differing(key, all_of_it, ours[key])
     ]
     heads = {"vision_heads": policy.model.vision.num_heads}
     others += [
@@ -90,4 +92,13 @@ def notes_on_settings(
         for key, value in beside.values.items()
         if key in {*ABOUT_WEIGHTS, *heads} and value != given.values.get(key, heads.get(key))
     ]
-    return [f"{unread}. It says {listing(others, 20)}"] if others else []
+    return [f"{unread}. With it: {listing(others, 20)}"] if others else []
+
+
+def _differing(key: str, theirs: object, ours: object) -> list[tuple[str, object, object]]:
+    """A value that differs, or the fields of it that do: name, theirs, ours."""
+    if isinstance(theirs, RealTime) and isinstance(ours, RealTime):
+        pairs = [(f"{key}.{one.name}", getattr(theirs, one.name), getattr(ours, one.name)) for one in fields(theirs)]
+    else:
+        pairs = [(key, theirs, ours)]
+    return [pair for pair in pairs if pair[1] != pair[2]]

@@ -42,6 +42,10 @@ of its own:
     turbopi eval chase work/chase/checkpoint --trials 200 --videos none --camera-px 48 --image-px 48 \\
         --execution async,sync,ensemble,rtc,rtc_identity,rtc_trained --delay-steps 0,2,4 --out work/chase_delays
 
+A SmolVLA for the same task, in LeRobot's layout: chase_smolvla.py. It needs turbopi[smolvla].
+
+    small_policy chase --model smolvla --out work/smolvla --seconds 3000 --frames 400000 --batch 64 --repeats 2
+
 The data are in expert.py, scenes.py and collect.py, the learning in forward.py and train.py.
 """
 
@@ -124,7 +128,8 @@ def _add_chase(parser: argparse.ArgumentParser) -> None:
 
 
 def _chase(arguments: argparse.Namespace) -> None:
-    from turbopi_lab.small_policy.chase import Settings, train
+    from turbopi_lab.small_policy.chase import Settings
+    from turbopi_lab.small_policy.chase_training import train
 
     train(Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)}))
 

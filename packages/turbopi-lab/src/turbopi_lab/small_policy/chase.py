@@ -1,4 +1,4 @@
-"""The policy of the chase (turbopi.sim.chase), trained with simulated delays: data, training, watching, export.
+"""The policy of the chase (turbopi.sim.chase), trained with simulated delays: data, losses, export.
 
     python -m turbopi_lab.small_policy chase --out work/chase --seconds 900
 
@@ -7,10 +7,8 @@ are those that are on their way already, from its plan of before, and the others
 the frame's delay in training; with 0 all of the chunk is planned now.
 """
 
-import csv
 import math
 import multiprocessing
-import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +21,7 @@ from torch import Tensor
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, RealTime, VisionConfig
 from turbopi.models.pi0.reference import Pi0Model
+from turbopi.models.pi0.vision import VisionTower
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.sim.chase import BLOB, INSTRUCTION, MAX_STEPS, POST, SPEED, VIEWS, Chase, cut
 from turbopi.sim.chase_expert import choose_sides, keep_sides, plan
@@ -58,6 +57,7 @@ CONFIG = PolicyConfig(
 @dataclass
 class Settings:
     out: Path
+    model: str = "pi05"  # or smolvla: chase_smolvla.py
     seconds: float = 900.0
     seed: int = 0
     workers: int = 1  # processes that make the demonstrations
@@ -85,6 +85,11 @@ class Frames:
 
     def to(self, device: torch.device) -> "Frames":
         return Frames(self.places.to(device), self.chunks.to(device), self.delays.to(device))
+
+    def undelayed(self) -> "Frames":
+        """Those whose chunk is planned now, for a family that holds no actions."""
+        rows = self.delays == 0
+        return Frames(self.places[rows], self.chunks[rows], self.delays[rows])
 
     def draw(self, number: int, *, mirrored: bool = True) -> "Frames":
         """As many of them, each turned around the post and, unless `mirrored` is False, half of them mirrored: it looks
@@ -196,27 +201,41 @@ def revive(world: Chase, rng: np.random.Generator) -> None:
 class Trainer:
     """Learns from `Frames`, all under one prompt: token ids and mask [1, P]; None: the chase's.
 
-    `start` is a checkpoint of the same sizes to begin with; None: fresh weights.
+    `start` is a checkpoint of the same sizes to begin with; None: fresh weights. Of a Pi0.5; another family's is
+    derived from it (chase_smolvla.py).
+
+    image_size  pixels of an image's side
+    holds       learns with actions that are on their way, and may be told them
     """
+
+    image_size = CONFIG.planned_model.vision.image_size
+    holds = True
 
     def __init__(
         self, settings: Settings, prompted: tuple[Tensor, Tensor] | None = None, start: Path | None = None
     ) -> None:
         self.settings, self.device = settings, torch.device(settings.device)
         torch.manual_seed(settings.seed)
-        if start is None:
-            self.model = fresh_model(CONFIG.planned_model, settings.seed)
-            _see_dots(self.model)
-        else:
-            self.model = trained_model(CONFIG.planned_model, start)
+        self.model: Any = self.fresh() if start is None else trained_model(CONFIG.planned_model, start)
         self.model.to(self.device)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
-        self.guide = Guide(CONFIG.planned_model.vlm.width, GUIDED, 1, queries=3).to(self.device)
+        self.guide = Guide(self.guide_width, GUIDED, 1, queries=3).to(self.device)
         self._parameters = [*self.model.parameters(), *self.guide.parameters()]
         self.optimizer = torch.optim.AdamW(self._parameters, settings.learning_rate, (0.9, 0.95), weight_decay=0.01)
         self.steps = 0
         self._weights = WEIGHTS.to(self.device)
         self.tokens, self.mask = (tensor.to(self.device) for tensor in prompted or prompt())
+
+    def fresh(self) -> Any:
+        """The model before training, on the CPU."""
+        model = fresh_model(CONFIG.planned_model, self.settings.seed)
+        see_dots(model.vision)
+        return model
+
+    @property
+    def guide_width(self) -> int:
+        """Numbers of a place of the prefix that `predict` gives the guide."""
+        return CONFIG.planned_model.vlm.width
 
     def step(self, batch: Frames, progress: float) -> tuple[float, float]:
         """The losses: of the flow, and of the guide."""
@@ -248,23 +267,47 @@ class Trainer:
         self.steps = self.settings.warmup_steps
 
     def losses(self, batch: Frames) -> tuple[Tensor, Tensor]:
-        rows, repeats = len(batch), self.settings.repeats
-        padded = torch.nn.functional.pad(batch.chunks, (0, CONFIG.model.action_dim - batch.chunks.shape[-1]))
+        repeats = self.settings.repeats
+        padded = torch.nn.functional.pad(self.scaled(batch.chunks), (0, len(WEIGHTS) - batch.chunks.shape[-1]))
         actions = padded.repeat_interleave(repeats, 0)
         held = held_actions(batch.delays.repeat_interleave(repeats, 0), HORIZON)
         noise, t = torch.randn_like(actions), draw_times(len(actions), self.device)
-        tokens, mask = self.tokens.expand(rows, -1), self.mask.expand(rows, -1)
-        x, camera_images = mixed(actions, noise, t, held), batch.camera_images(CONFIG.planned_model.vision.image_size)
-        predicted, hidden = velocity(self.model, camera_images, tokens, mask, x, t, held=held)
+        predicted, hidden, mask = self.predict(batch, mixed(actions, noise, t, held), t, held)
         guessed, _ = self.guide(hidden, mask)
         guide = torch.nn.functional.smooth_l1_loss(guessed, batch.guided(), beta=0.1)
         return flow_loss(predicted, noise - actions, self._weights, held), guide
 
+    def scaled(self, chunks: Tensor) -> Tensor:
+        """Actions [N, H, 2] as the model has them."""
+        return chunks
 
-def _see_dots(model: Pi0Model) -> None:
+    def predict(self, batch: Frames, x: Tensor, t: Tensor, held: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The velocity at x [N * R, H, action_dim] and times t [N * R], and for the guide: the prefix [N, S, D], and
+        which of its last P places are there, bool[N, P]; before them are the images' places.
+        """
+        tokens, mask = (tensor.expand(len(batch), -1) for tensor in (self.tokens, self.mask))
+        return *velocity(self.model, batch.camera_images(self.image_size), tokens, mask, x, t, held=held), mask
+
+    def averaged(self) -> Any:
+        """The model with the averaged weights."""
+        model = Pi0Model(CONFIG.planned_model).to(self.device)
+        model.load_state_dict(self.average)
+        return model
+
+    def sample(self, model: Any, world: Chase, noise: Tensor, given: Tensor, delay: int) -> Tensor:
+        """What `averaged` does in N episodes, float32[N, H, action_dim]: noise, and `delay` actions that are given."""
+        return sample(model, torch.from_numpy(world.draw(self.image_size)).to(self.device), noise, given, delay)
+
+    def export(self) -> None:
+        """Write the averaged weights as a checkpoint."""
+        state = {name: value.cpu() for name, value in self.average.items()}
+        export(state, stats(), self.settings.out / "checkpoint", config=CONFIG)
+
+
+def see_dots(vision: VisionTower) -> None:
     """Images are mostly dark, with small dots: begin with patches that see nothing in the dark, and dots well."""
     with torch.no_grad():
-        patches = model.vision.patch_embedding
+        patches = vision.patch_embedding
         patches.weight.mul_(5)
         assert patches.bias is not None
         patches.bias.copy_(patches.weight.sum(dim=(1, 2, 3)))  # black is -1
@@ -288,83 +331,6 @@ def sample(model: Pi0Model, camera_images: Tensor, noise: Tensor, given: Tensor,
         v, _ = velocity(model, camera_images, tokens, mask, x, t, held=held)
         x = torch.where(held[..., None], given, x - v / steps)
     return x
-
-
-def watch(model: Pi0Model, delay: int, trained: bool, episodes: int = 100, every: int = 5) -> float:
-    """Share of practice episodes that are solved under a delay, joining chunks or not."""
-    device = next(model.parameters()).device
-    world = Chase.start([np.random.default_rng([2**41, row]) for row in range(episodes)])
-    for _ in range(10):
-        world.step(np.zeros((episodes, 2)))
-    world.cleared()
-    noises = torch.Generator().manual_seed(0)
-
-    def ask(given: Tensor, d: int) -> Tensor:
-        camera_images = torch.from_numpy(world.draw(CONFIG.planned_model.vision.image_size)).to(device)
-        noise = torch.randn(episodes, HORIZON, CONFIG.model.action_dim, generator=noises).to(device)
-        return sample(model, camera_images, noise, given, d)
-
-    chunk = ask(torch.zeros(episodes, HORIZON, CONFIG.model.action_dim, device=device), 0)
-    solved, place, arrives = np.zeros(episodes, np.bool_), 0, -1
-    for step in range(MAX_STEPS):
-        if step and step % every == 0:
-            left = torch.nn.functional.pad(chunk[:, place:], (0, 0, 0, place))
-            coming, arrives = ask(left, delay if trained else 0), step + delay
-        if step == arrives:
-            chunk, place = coming, delay
-        solved |= world.step(chunk[:, place, :2].cpu().double().numpy())
-        place += 1
-    return float(solved.mean())
-
-
-def train(settings: Settings) -> None:
-    """Writes checkpoint/ and curves.csv into `settings.out`."""
-    settings.out.mkdir(parents=True, exist_ok=True)
-    begun = time.monotonic()
-    frames = demonstrations(settings.frames, settings.seed, settings.workers)
-    print(f"{len(frames)} frames in {time.monotonic() - begun:.0f} s", flush=True)
-    trainer = Trainer(settings)
-    frames = frames.to(trainer.device)
-    if settings.resume is not None:
-        trainer.load(settings.resume)
-    started = watched = time.monotonic()
-    rows: list[dict[str, float]] = []
-    losses: list[tuple[float, float]] = []
-    while (progress := min(1.0, (time.monotonic() - started) / settings.seconds)) < 1:
-        losses.append(trainer.step(frames.draw(settings.batch), progress))
-        if time.monotonic() - watched > settings.watch_every:
-            watched = time.monotonic()
-            trainer.save(settings.out / "state.pt")
-            rows.append(_reported(trainer, losses, watched - started))
-            losses.clear()
-    trainer.save(settings.out / "state.pt")
-    if losses:
-        rows.append(_reported(trainer, losses, time.monotonic() - started))
-    with (settings.out / "curves.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    export(
-        {name: value.cpu() for name, value in trainer.average.items()},
-        stats(),
-        settings.out / "checkpoint",
-        config=CONFIG,
-    )
-
-
-def _reported(trainer: Trainer, losses: list[tuple[float, float]], seconds: float) -> dict[str, float]:
-    model = Pi0Model(CONFIG.planned_model).to(trainer.device)
-    model.load_state_dict(trainer.average)
-    row = {"seconds": round(seconds), "step": trainer.steps, **_mean(losses)}
-    for delay, trained in ((0, False), (4, False), (4, True)):
-        row[f"delay {delay}{', held' if trained else ''}"] = watch(model, delay, trained)
-    print(row, flush=True)
-    return row
-
-
-def _mean(losses: list[tuple[float, float]]) -> dict[str, float]:
-    flow, guide = np.mean(losses, axis=0)
-    return {"flow": round(float(flow), 4), "guide": round(float(guide), 5)}
 
 
 def stats() -> NormStats:

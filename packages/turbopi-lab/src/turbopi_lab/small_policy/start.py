@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from turbopi.checkpoint import open_checkpoint
-from turbopi.config import ModelConfig
+from turbopi.config import ModelConfig, VisionConfig
 from turbopi.models.pi0.reference import Pi0Model
 
 
@@ -22,7 +22,7 @@ def fresh_model(config: ModelConfig, seed: int) -> Pi0Model:
     model = Pi0Model(config)
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            parameter.copy_(_initial(name, parameter, config, generator))
+            parameter.copy_(initial(name, parameter, config.vision, config.vlm.depth, generator))
     return model.requires_grad_(True)
 
 
@@ -36,9 +36,10 @@ def trained_model(config: ModelConfig, folder: Path) -> Pi0Model:
     return model.requires_grad_(True)
 
 
-def _initial(name: str, parameter: Tensor, config: ModelConfig, generator: torch.Generator) -> Tensor:
+def initial(name: str, parameter: Tensor, vision: VisionConfig, depth: int, generator: torch.Generator) -> Tensor:
+    """A parameter's first value, see `fresh_model`; depth: layers of the language model."""
     if name == "vision.position_embedding.weight":
-        return 0.5 * position_sines(config.vision.num_tokens, config.vision.width)
+        return 0.5 * position_sines(vision.num_tokens, vision.width)
     if name.startswith("action_out_proj") or (name.startswith("expert.") and ".dense." in name):
         return torch.zeros_like(parameter)
     if parameter.ndim == 1:
@@ -47,8 +48,7 @@ def _initial(name: str, parameter: Tensor, config: ModelConfig, generator: torch
     fan_in = parameter[0].numel()
     scale = 1 / math.sqrt(fan_in)
     if name.endswith(("o_proj.weight", "out_proj.weight", "down_proj.weight", "fc2.weight")):
-        depth = config.vision.depth if name.startswith("vision.") else config.vlm.depth
-        scale /= math.sqrt(2 * depth)
+        scale /= math.sqrt(2 * (vision.depth if name.startswith("vision.") else depth))
     return torch.randn(parameter.shape, generator=generator) * scale
 
 
