@@ -31,6 +31,7 @@ from turbopi.recordings import iter_recording, load_call
 from turbopi.serve import PolicyServer, ServerOptions, running
 from turbopi.serve.launch import addresses
 from turbopi.serve.limits import Limits
+from turbopi.serve.requests import ClientLeft, ClientRequest, RequestHandler, Result
 from turbopi.serve.server import SWITCH_SECONDS
 from turbopi.support.errors import ConfigError, DeviceLost
 
@@ -302,6 +303,7 @@ def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pyt
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         async with client(server) as connection:
             await infer(connection, observation("one"))
+            await eventually(lambda: metric(server, "turbopi_request_seconds_count") == 1)
             if how == "ends":
                 connection.transport.close()
             else:
@@ -314,6 +316,29 @@ def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pyt
     assert len(reported) == 2
     assert re.fullmatch(r"127\.0\.0\.1:\d+ connected", reported[0])
     assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", reported[1])
+
+
+def test_who_leaves_with_its_answer_has_been_answered(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The policy's thread sends it: the client may be gone before the task of its connection wakes."""
+    results_of = RequestHandler._results
+
+    async def gone(self: RequestHandler, request: ClientRequest) -> list[Result]:
+        await results_of(self, request)
+        raise ClientLeft
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            await infer(connection, observation("one"))
+        await eventually(lambda: metric(server, "turbopi_clients") == 0)
+        assert metric(server, "turbopi_request_seconds_count") == 1
+        assert metric(server, "turbopi_errors_total", kind="disconnected") == 0
+
+    monkeypatch.setattr(RequestHandler, "_results", gone)
+    with caplog.at_level(logging.INFO, "turbopi"):
+        served(test)
+    assert not any("left during" in message for message in caplog.messages)
 
 
 def test_the_log_says_whose_request_is_refused(caplog: pytest.LogCaptureFixture) -> None:

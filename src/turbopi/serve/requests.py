@@ -261,7 +261,13 @@ class RequestHandler:
 
     async def finish(self, request: ClientRequest) -> Reply | Refusal:
         """The reply to a request. Raises PolicyFailed and ClientLeft."""
-        results = await self._results(request)
+        try:
+            results = await self._results(request)
+        except ClientLeft:
+            if request.reply is None or request.reply.sent is None:
+                raise
+            self._metrics.scheduled(request.scheduling.priority, None)
+            return request.reply  # it left with its answer, before this task woke: that counts, and is recorded
         failed = first_error(request, results)
         self._metrics.scheduled(request.scheduling.priority, None if failed is None else failed.error)
         if failed is None:
