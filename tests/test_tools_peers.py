@@ -33,7 +33,7 @@ if fault == "no start": sys.exit("no such GPU")
 if fault == "hangs at start": time.sleep(60)
 if fault == "tells when": note(" ready")
 if fault == "chats": say("loading weights ...")
-say({"ready": True, "note": "a fake", "versions": {"fake": "1"}, "setup_s": 0.1})
+say({"ready": True, "note": "a fake" + job.get("of", ""), "versions": {"fake": "1"}, "setup_s": 0.1})
 if fault == "speaks twice": say({"ready": True})
 for number, line in enumerate(sys.stdin):
     calls = json.loads(line)["calls"]
@@ -224,15 +224,21 @@ def test_every_setting_has_a_row_in_the_table() -> None:
 # --- the tool ---------------------------------------------------------------------------------------------------------
 
 
+def programs_are(monkeypatch: pytest.MonkeyPatch, ours: entries.Program, *others: entries.Program) -> None:
+    monkeypatch.setattr(tool, "OURS", ours)
+    monkeypatch.setattr(tool, "BY_NAME", {one.name: one for one in (ours, *others)})
+    monkeypatch.setattr(tool, "OTHERS", [one.name for one in others])
+
+
 def test_a_run_is_one_file_that_the_table_is_written_from(
     fake: entries.Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ours = replace(fake, name="turbopi", install=())
-    other = replace(fake, name="lerobot", settings=("bf16 eager",))
-    absent = replace(fake, name="sglang", needs_checkpoint=True)
-    monkeypatch.setattr(tool, "OURS", ours)
-    monkeypatch.setattr(tool, "BY_NAME", {one.name: one for one in (ours, other, absent)})
-    monkeypatch.setattr(tool, "OTHERS", ["lerobot", "sglang"])
+    programs_are(
+        monkeypatch,
+        replace(fake, name="turbopi", install=()),
+        replace(fake, name="lerobot", settings=("bf16 eager",)),
+        replace(fake, name="sglang", needs_checkpoint=True),
+    )
     file, out = tmp_path / "peers.json", io.StringIO()
     words = ["--home", str(tmp_path / "home"), "run", "--python", f"lerobot={sys.executable}", "--device=cpu"]
     words += ["--horizons=10,50", "--rounds=2", "--calls=2", "--out", str(file)]
@@ -251,6 +257,7 @@ def test_a_run_is_one_file_that_the_table_is_written_from(
         "| LeRobot, PyTorch eager | 2.50 | 2.50 | 2.50 | 2.50 |",
         "| SGLang, bf16 | not measured | | | |",
     ]
+    rows_of_pi05 = table.peers(table.read_run(file))[2:]
     assert tool.main([*words, "--dry-run", "--peers=lerobot"], Console(file=out, width=200)) == 0
     out.truncate(0)
     assert tool.main([*words, "--dry-run", "--without=lerobot=bf16 eager"], Console(file=out, width=200)) == 0
@@ -262,10 +269,41 @@ def test_a_run_is_one_file_that_the_table_is_written_from(
     rows = table.peers(older, newer)[2:]
     assert rows[0] == "| Turbo-Pi, bf16 | 2.50 | 2.50 | 2.50 | 2.50 |"
     assert rows[2] == "| SGLang, bf16 (2026-11-28) | 40.00 |  |  |  |"  # the newer run has no figure of it
-    small = json.loads(file.read_text()) | {"small": True}
-    file.write_text(json.dumps(small))
-    with pytest.raises(ConfigError, match="small models"):
-        table.read_run(file)
+    written = json.loads(file.read_text())
+    unnamed = {key: value for key, value in written.items() if key != "model"}  # as files were before
+    for changed, said in (
+        (unnamed | {"small": True}, "small models"),
+        (written | {"model": "smolvla"}, "is of smolvla"),
+    ):
+        file.write_text(json.dumps(changed))
+        with pytest.raises(ConfigError, match=said):
+            table.read_run(file)
+    file.write_text(json.dumps(unnamed))
+    assert table.peers(table.read_run(file))[2:] == rows_of_pi05
+
+
+def test_another_models_run_has_the_programs_that_run_it(
+    fake: entries.Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs_are(
+        monkeypatch,
+        replace(fake, name="turbopi", install=(), also={"smolvla": {}}),
+        replace(fake, name="lerobot", also={"smolvla": {"settings": ("bf16 eager", "bf16 compiled"), "tunes": True}}),
+        replace(fake, name="flashrt"),
+    )
+    Path(fake.script).write_text(FAKE.replace('job.get("of", "")', '" of " + job["model"]'))
+    file, out = tmp_path / "smolvla.json", io.StringIO()
+    words = ["run", "--python", f"lerobot={sys.executable}", "--device=cpu", "--model=smolvla", "--horizons=10"]
+    words += ["--rounds=1", "--calls=1", "--without=lerobot=bf16 eager", "--out", str(file)]
+    assert tool.main(words, Console(file=out, width=200)) == 0
+    assert "left out: flashrt: not timed with smolvla" in out.getvalue()
+    run = read_peers_run(file)
+    assert (run.model, run.not_measured) == ("smolvla", [])
+    assert {(one.program, one.setting, one.note) for one in run.timed} == {
+        ("turbopi", "bf16", "a fake of smolvla"),
+        ("lerobot", "bf16 compiled", "a fake of smolvla"),
+    }
+    assert {(one.job.image_width, one.job.image_height) for one in run.timed} == {(640, 480)}
 
 
 @pytest.mark.parametrize(
@@ -276,6 +314,8 @@ def test_a_run_is_one_file_that_the_table_is_written_from(
         (["run", "--horizons=ten"], "ten"),
         (["run", "--without=flashrt=fp8"], "--without flashrt=fp8: expected bf16; fp8 nt_autotune=force; fp8"),
         (["run", "--without=tensorrt=bf16"], "--without tensorrt=bf16: expected a NAME of turbopi, flashrt"),
+        (["run", "--model=smolvla", "--peers=flashrt"], "flashrt is not timed with smolvla; expected some of lerobot"),
+        (["run", "--model=smolvla", "--without=lerobot=bf16"], "expected bf16 eager; bf16 compiled"),
     ],
 )
 def test_a_wrong_word_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -109,6 +109,8 @@ def _json(file: Path) -> Milliseconds:
     job = Job()
     if read_json(file, ConfigError).get("kind") == "turbopi-peers":
         run = read_peers_run(file)
+        if run.model != "pi05":
+            raise ConfigError(f"{file} is of {run.model}, and this table of pi05: give it a name that no run here has")
         found: dict[Key, float | None] = {
             (one.program, one.setting, part, (one.job or job).horizon): None
             for one in run.not_measured

@@ -26,9 +26,9 @@ DEPTH, HEADS, HEAD_DIM = 2, 8, 8
 WIDTHS = {"gemma_2b": (24, 40), "gemma_300m": (16, 24)}  # (width, mlp_dim)
 
 
-def shrink() -> None:
-    """Let LeRobot make small models from now on, and tokenise without its hub."""
-    for module in (modeling_pi0, modeling_pi05):
+def shrink(*more: ModuleType) -> None:
+    """Let LeRobot make small models from now on, and tokenise without its hub. more: modules of other models."""
+    for module in (modeling_pi0, modeling_pi05, *more):
         _shrink(module)
     tokenizer_processor.AutoTokenizer = _SmallTokenizer
 
@@ -84,7 +84,8 @@ class _SmallTokenizer:
 
 
 def _shrink(module: ModuleType) -> None:
-    paligemma, expert = module.PaliGemmaForConditionalGenerationWithPiGemma, module.PiGemmaForCausalLM
+    paligemma = module.PaliGemmaForConditionalGenerationWithPiGemma
+    expert: Any = getattr(module, "PiGemmaForCausalLM", None)  # Pi0-FAST has none
 
     def sizes(variant: str) -> Any:
         width, mlp_dim = WIDTHS[variant]

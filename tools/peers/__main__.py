@@ -4,9 +4,12 @@
     python -m peers install lerobot                     into build/peers/lerobot; `all` installs each
     python -m peers run --peers all --out benchmarks/results/h200_DATE_peers/peers.json
     python -m peers run --peers lerobot,openpi-pytorch --dry-run
+    python -m peers run --model smolvla --horizons 50 --out FOLDER/smolvla.json
+    python -m peers run --model pi0_fast --horizons 10 --steps 30 --out FOLDER/pi0_fast.json    steps: tokens written
 
-Pi0.5 of full size, random weights, the same job for all. Turbo-Pi always runs too. For each horizon all programs stand
-ready, in processes of their own, and are called in turns, so they need room on the GPU together: some 100 GB for all.
+Pi0.5, or --model, of full size, random weights, the same job for all that run it. Turbo-Pi always runs too. For each
+horizon all programs stand ready, in processes of their own, and are called in turns, so they need room on the GPU
+together: some 100 GB for all.
 The file is written after each round. What can't be installed, doesn't start or fails in a call is in it with its
 reason, and has no figures. Exit code 1 if a program that was requested has none.
 """
@@ -15,6 +18,7 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
+from typing import get_args
 
 import torch
 from msgspec import json
@@ -23,10 +27,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from peers.document import NotMeasured, PeersRun, Timed
-from peers.entries import BY_NAME, OURS, PROGRAMS, Program
+from peers.entries import BY_NAME, IMAGES, OURS, PROGRAMS, Model, Program
 from peers.installing import commands, folder_of, install, missing, python_of
 from peers.running import Limits, time_job
 from turbopi.bench.work import Job
+from turbopi.models.smolvla.config import PUBLISHED
 from turbopi.support.files import write_whole
 from turbopi.support.provenance import Gpu, provenance
 
@@ -47,6 +52,7 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     installing.add_argument("--site-packages", action="store_true", help="environments see this Python's packages")
     running = verbs.add_parser("run", help="time programs beside Turbo-Pi")
     running.add_argument("--peers", default="all", help=f"some of {','.join(OTHERS)}; all")
+    running.add_argument("--model", choices=get_args(Model), default="pi05")
     running.add_argument(
         "--without", action="append", default=[], metavar="NAME=SETTING", help="leave out: 'openpi-pytorch=bf16 eager'"
     )
@@ -58,7 +64,7 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     running.add_argument("--cameras", type=int, default=2)
     running.add_argument("--prompt-tokens", type=int, default=48)
     running.add_argument("--horizons", default="10,50")
-    running.add_argument("--steps", type=int, default=10)
+    running.add_argument("--steps", type=int, default=10, help="of denoising; of pi0_fast tokens")
     running.add_argument("--rounds", type=int, default=5)
     running.add_argument("--calls", type=int, default=40, help="of each part in a round")
     running.add_argument("--start-s", type=float, metavar="S", help="to get ready, instead of each program's own limit")
@@ -74,20 +80,24 @@ def main(arguments: list[str] | None = None, console: Console | None = None) -> 
     if given.verb == "list":
         return show(given.home, console)
     try:
-        programs = chosen(",".join(given.names) if given.verb == "install" else given.peers)
         if given.verb == "install":
-            return install_all(programs, given, console)
-        return run(programs, given, console)
+            return install_all(chosen(",".join(given.names)), given, console)
+        return run(chosen(given.peers, given.model), given, console)
     except ValueError as error:  # ConfigError among them
         parser.error(str(error))
 
 
-def chosen(names: str) -> list[Program]:
-    """Of "a,b" or "all", in the order that they are timed in. Raises ValueError for another name."""
+def chosen(names: str, model: str = "pi05") -> list[Program]:
+    """Of "a,b" or "all", in the order that they are timed in. Raises ValueError for another name, and for one that
+    doesn't run the model.
+    """
     wanted = OTHERS if names == "all" else [name for name in names.split(",") if name]
     for name in wanted:
         if name not in OTHERS:
             raise ValueError(f"no program is named {name!r}; expected some of {', '.join(OTHERS)}, or all")
+        if names != "all" and BY_NAME[name].of(model) is None:
+            having = [other for other in OTHERS if BY_NAME[other].of(model)]
+            raise ValueError(f"{name} is not timed with {model}; expected some of {', '.join(having)}, or all")
     return [BY_NAME[name] for name in OTHERS if name in wanted]
 
 
@@ -125,9 +135,13 @@ Setting = tuple[Program, str, str, dict[str, object]]  # program, setting, its P
 
 
 def run(programs: list[Program], given: argparse.Namespace, console: Console) -> int:
-    jobs = [Job(given.cameras, given.prompt_tokens, int(horizon), given.steps) for horizon in given.horizons.split(",")]
+    shape, images = (given.cameras, given.prompt_tokens), IMAGES.get(given.model, {})
+    jobs = [Job(*shape, int(horizon), given.steps, **images) for horizon in given.horizons.split(",")]
+    if none := [program.name for program in programs if program.of(given.model) is None]:
+        console.print(escape(f"left out: {', '.join(none)}: not timed with {given.model}"))
     with tempfile.TemporaryDirectory(prefix="peers-run-") as shared:
-        settings, lost = to_run([OURS, *programs], given, shared)
+        having = [found for program in (OURS, *programs) if (found := program.of(given.model))]
+        settings, lost = to_run(having, given, shared)
         if not given.dry_run:
             return time_all(settings, lost, jobs, given, console)
     for program, setting, python, _ in settings:
@@ -139,7 +153,7 @@ def run(programs: list[Program], given: argparse.Namespace, console: Console) ->
 def to_run(programs: list[Program], given: argparse.Namespace, shared: str) -> tuple[list[Setting], list[NotMeasured]]:
     """The settings that can run, and those that can't. shared: a folder that lasts as long as the run."""
     pythons, sources = (_named(pairs) for pairs in (given.python, given.src))
-    without = left_out(given.without)
+    without = left_out(given.without, given.model)
     lost: list[NotMeasured] = []
     settings: list[Setting] = []
     for program in programs:
@@ -149,6 +163,8 @@ def to_run(programs: list[Program], given: argparse.Namespace, shared: str) -> t
         python = pythons.get(program.name, python_of(program, given.home))
         words: dict[str, object] = {
             "device": given.device,
+            "model": given.model,
+            "smolvlm": PUBLISHED["HuggingFaceTB/SmolVLM2-500M-Video-Instruct"],
             "small": given.small,
             "src": str(Path(sources.get(program.name, folder_of(program, given.home) / "src")).resolve()),
             "commit": program.git[1][:8] if program.git else "",
@@ -156,8 +172,8 @@ def to_run(programs: list[Program], given: argparse.Namespace, shared: str) -> t
             "shared": shared,
         }
         for setting in program.settings:
-            if (program.name, setting) in without or (given.device == "cpu" and setting.startswith("fp8")):
-                continue  # on a CPU no program has FP8
+            if (program.name, setting) in without or (given.device == "cpu" and setting.startswith(("fp8", "int8"))):
+                continue  # on a CPU no program has these
             if reason is None:
                 settings.append((program, setting, python, words))
             else:
@@ -167,12 +183,12 @@ def to_run(programs: list[Program], given: argparse.Namespace, shared: str) -> t
     return settings, lost
 
 
-def left_out(pairs: list[str]) -> set[tuple[str, str]]:
-    """(program, setting) of each NAME=SETTING. Raises ValueError for what no program has."""
+def left_out(pairs: list[str], model: str) -> set[tuple[str, str]]:
+    """(program, setting) of each NAME=SETTING. Raises ValueError for what no program has, with that model."""
     found = {(name, setting) for name, _, setting in (pair.partition("=") for pair in pairs)}
-    known = {(program.name, setting) for program in BY_NAME.values() for setting in program.settings}
-    for name, setting in found - known:
-        expected = "; ".join(BY_NAME[name].settings) if name in BY_NAME else f"a NAME of {', '.join(BY_NAME)}"
+    known = {one.name: one.settings for program in BY_NAME.values() if (one := program.of(model))}
+    for name, setting in found - {(name, setting) for name, settings in known.items() for setting in settings}:
+        expected = "; ".join(known[name]) if name in known else f"a NAME of {', '.join(known)}"
         raise ValueError(f"--without {name}={setting}: expected {expected}")
     return found
 
@@ -199,6 +215,7 @@ def time_all(
             clocks=clocks,
             command=["python", "-m", "peers", *sys.argv[1:]],
             small=given.small,
+            model=given.model,
             timed=[*timed, *of_job],
             not_measured=[*lost, *lost_of_job],
         )

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from peers.entries import Model
 from turbopi.bench.work import Job
 from turbopi.support.errors import ConfigError
 from turbopi.support.provenance import Gpu, Provenance
@@ -48,6 +49,7 @@ class PeersRun(Struct, frozen=True, kw_only=True):
     clocks: list[Gpu]  # before each round, and at the end; none on a CPU
     command: list[str]
     small: bool  # small models, to try the tool: no figure
+    model: Model = "pi05"  # not in older files
     timed: list[Timed]
     not_measured: list[NotMeasured]
 

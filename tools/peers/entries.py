@@ -5,21 +5,27 @@ A command's words may have {python} (of the program's own environment), {tool} (
 """
 
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
 DRIVERS = Path(__file__).parent / "drivers"
 TOOLS = DRIVERS.parents[1]
+Model = Literal["pi05", "smolvla", "pi0_fast"]
+# What cameras send; of models that aren't here what the model reads
+IMAGES: Mapping[str, Mapping[str, Any]] = {"smolvla": {"image_width": 640, "image_height": 480}}
 _TORCH = "torch==2.11.0"  # ours on a GPU too; an owner's own where it pins one
 
 
 @dataclass(frozen=True)
 class Program:
-    """One program. `settings`: as docs/performance.md's table knows them (tools/doc_tables/peers.py).
+    """One program. `settings`: of Pi0.5, as docs/performance.md's table knows them (tools/doc_tables/peers.py).
 
     git      repository and commit that are fetched to {src}
     install  commands, in order, after its environment is made; none: the environment that runs the tool
     tunes    it times candidates while it gets ready, so nothing else may run then
+    also     other models that it runs -> what differs there
     """
 
     name: str
@@ -31,10 +37,15 @@ class Program:
     needs_checkpoint: bool = False
     tunes: bool = False
     start_s: float = 300.0  # to get ready: compiling and capturing are in it
+    also: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def script(self) -> Path:
         return DRIVERS / self.driver
+
+    def of(self, model: str) -> "Program | None":
+        """The program as it runs that model; None if it doesn't."""
+        return self if model == "pi05" else replace(self, **self.also[model]) if model in self.also else None
 
     def fetching(self, src: Path) -> list[list[str]]:
         """Commands that bring the sources."""
@@ -68,7 +79,12 @@ _OVER_TRANSFORMERS = (
     "shutil.copytree(sys.argv[1], there, dirs_exist_ok=True)"
 )
 
-OURS = Program("turbopi", "run_turbopi.py", ("bf16", "fp8"))
+OURS = Program(
+    "turbopi",
+    "run_turbopi.py",
+    ("bf16", "fp8"),
+    also={"smolvla": {"settings": ("bf16",)}, "pi0_fast": {"settings": ("bf16", "int8-weights")}},
+)
 PROGRAMS = (
     OURS,
     Program(
@@ -110,6 +126,10 @@ PROGRAMS = (
         ("bf16 eager",),
         install=(_pip("lerobot[pi]==0.6.1"),),
         python="python3.12",
+        also={
+            "smolvla": {"settings": ("bf16 eager", "bf16 compiled"), "tunes": True, "start_s": 600.0},
+            "pi0_fast": {},  # its compile_model leaves decoding with a KV cache as it is
+        },
     ),
     Program(
         "sglang",

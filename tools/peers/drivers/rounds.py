@@ -1,6 +1,6 @@
 """What every driver does around its program. A driver is a script:
 
-    python run_PROGRAM.py JOB    JOB: {"setting", "cameras", "prompt_tokens", "horizon", "steps", "device", "small", …}
+    python run_PROGRAM.py JOB    JOB: {"setting", "model", "cameras", "prompt_tokens", "horizon", "steps", "device", …}
 
 It builds the program once and says so; then, for each line {"calls": n, "seconds": s} of its input, it times n calls of
 each part, or fewer where they take longer than s, and answers with a line. Its output is for these lines alone:
@@ -43,9 +43,9 @@ def clocked(call: Callable[[], Any], after: Callable[[Any], Any] = lambda action
 
 
 def random_images(job: dict[str, Any]) -> Callable[[], list[np.ndarray]]:
-    """Each time other images, uint8[224, 224, 3], one for each camera."""
-    rng = np.random.default_rng(0)
-    return lambda: [rng.integers(0, 256, (224, 224, 3), dtype=np.uint8) for _ in range(job["cameras"])]
+    """Each time other images, uint8[height, width, 3], one for each camera."""
+    rng, shape = np.random.default_rng(0), (job.get("image_height", 224), job.get("image_width", 224), 3)
+    return lambda: [rng.integers(0, 256, shape, dtype=np.uint8) for _ in range(job["cameras"])]
 
 
 def serve(build: Callable[[dict[str, Any]], Built]) -> None:
