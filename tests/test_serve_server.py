@@ -324,7 +324,7 @@ def test_who_leaves_with_its_answer_has_been_answered(
     """The policy's thread sends it: the client may be gone before the task of its connection wakes."""
     results_of = RequestHandler._results
 
-    async def gone(self: RequestHandler, request: ClientRequest) -> list[Result]:
+    async def lost(self: RequestHandler, request: ClientRequest) -> list[Result]:
         await results_of(self, request)
         raise ClientLeft
 
@@ -335,7 +335,7 @@ def test_who_leaves_with_its_answer_has_been_answered(
         assert metric(server, "turbopi_request_seconds_count") == 1
         assert metric(server, "turbopi_errors_total", kind="disconnected") == 0
 
-    monkeypatch.setattr(RequestHandler, "_results", gone)
+    monkeypatch.setattr(RequestHandler, "_results", lost)
     with caplog.at_level(logging.INFO, "turbopi"):
         served(test)
     assert not any("left during" in message for message in caplog.messages)
