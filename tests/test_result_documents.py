@@ -1,7 +1,6 @@
 """Result documents: each kind is one Struct; what is checked in reads through it and comes out as it was."""
 
 import json
-import lzma
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +13,7 @@ from attack.results import AttackDocument
 from kernel_turns.document import read_turns
 from load_test.document import read_load
 from msgspec import Meta, Struct
-from packed import read_packed_benchmark
+from packed import content_of, read_packed_benchmark
 
 from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import fingerprint
@@ -129,8 +128,7 @@ EVERY = sorted(
 
 
 def text_of(name: str) -> str:
-    data = (RESULTS / name).read_bytes()
-    return (lzma.decompress(data) if name.endswith(".xz") else data).decode()
+    return content_of(RESULTS / name).decode()
 
 
 def _provenance(content: object) -> list[dict[str, object]]:

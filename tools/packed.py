@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from msgspec import Struct
 
-from turbopi.bench.document import BenchDocument, as_benchmark
+from turbopi.bench.document import BenchDocument, as_benchmark, read_benchmark
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import as_document, read_document
 
@@ -32,4 +32,4 @@ def read_packed(file: Path, kind: type[T]) -> T:
 
 def read_packed_benchmark(file: Path) -> BenchDocument:
     """Raises ConfigError as `read_benchmark`."""
-    return as_benchmark(json.loads(content_of(file)), file)
+    return as_benchmark(json.loads(content_of(file)), file) if file.suffix == ".xz" else read_benchmark(file)

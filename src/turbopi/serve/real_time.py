@@ -172,9 +172,10 @@ class RealTime:
         mode = requested.mode or self._options.execution
         if mode is not None and mode not in self._modes:
             raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
-        guidance = {PREFIX + name: value for name, value in (requested.guidance or {}).items()}
-        if mode is not None and (why := refuses_guidance(mode, guidance)) is not None:
-            raise ObservationError(why)
+        if mode is not None and requested.guidance:
+            named = {PREFIX + name: value for name, value in requested.guidance.items()}
+            if (why := refuses_guidance(mode, named)) is not None:
+                raise ObservationError(why)
         if requested.session is None and (requested.previous is not None or requested.model_actions):
             if not self._remembers and (requested.step is not None or requested.reset):
                 raise ObservationError(

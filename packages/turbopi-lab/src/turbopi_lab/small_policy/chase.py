@@ -205,7 +205,7 @@ class Trainer:
     derived from it (chase_smolvla.py).
 
     image_size  pixels of an image's side
-    holds       learns with actions that are on their way, and may be told them
+    holds       learns with actions that are on their way, and may be given them
     """
 
     image_size = CONFIG.planned_model.vision.image_size
