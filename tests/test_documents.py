@@ -174,9 +174,10 @@ def test_the_plot_beside_others_is_of_the_table() -> None:
     assert f"<!-- table: peers {' '.join(peers.RUNS)} -->" in page
     assert peers.PLOT.as_posix() in (ROOT / "README.md").read_text(encoding="utf-8")
     drawn = peers.bars(ROOT)
-    assert [name for name, _ in drawn] == [*peers.DRAWN[:-1], "openpi, PyTorch compiled (on the GPU alone)"]
+    undated = [re.sub(r" \(\d{4}-\d\d-\d\d\)", "", name) for name, _ in drawn]
+    assert undated == [*peers.DRAWN[:-1], "openpi, PyTorch compiled (on the GPU alone)"]
     for name, ms in drawn:
-        (row,) = re.findall(rf"^\| {name.removesuffix(' (on the GPU alone)')} \|.*$", page, re.MULTILINE)
+        (row,) = re.findall(rf"^\| {re.escape(name.replace(' (on the GPU alone)', ''))} \|.*$", page, re.MULTILINE)
         assert f"| {ms:.2f} |" in row
     assert (ROOT / peers.PLOT).stat().st_size < 20_000
 
@@ -195,8 +196,8 @@ def test_the_plot_beside_others_is_drawn_anew_for_other_figures(tmp_path: Path) 
 
 
 def test_a_new_run_beside_others_is_in_the_table_once_it_lies_there(tmp_path: Path) -> None:
-    folder = (tmp_path / RESULTS / peers.RUNS[0]).parent
-    shutil.copytree(ROOT / RESULTS / folder.name, folder)
+    for folder in (ROOT / RESULTS).glob("h200_*_peers"):
+        shutil.copytree(folder, tmp_path / RESULTS / folder.name)
     page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
     (before,) = re.findall(r"<!-- table: peers .*?<!-- end of table -->", page, re.DOTALL)
     assert blocks.filled(before, tmp_path, tmp_path / "docs") == before
@@ -208,7 +209,7 @@ def test_a_new_run_beside_others_is_in_the_table_once_it_lies_there(tmp_path: Pa
     new.parent.mkdir()
     new.write_text(json.dumps(run))
     after = blocks.filled(before, tmp_path, tmp_path / "docs")
-    assert "| FlashRT, bf16 | 17.50 |  |  |  |" in after and "| FlashRT, FP8 (2026-11-28) | 15.02 |" in after
+    assert "| FlashRT, bf16 | 17.50 |  |  |  |" in after and "| FlashRT, FP8 (2026-11-29) | 16.01 |" in after
     assert "(../benchmarks/results/h200_2026-12-01_peers/peers.json)" in after
     assert ("FlashRT, bf16", 17.5) in peers.bars(tmp_path)
 
