@@ -29,8 +29,8 @@ from turbopi.kernels.tile_table import LIBRARY, Knobs
 from turbopi.quantization.formats import INT8
 from turbopi.quantization.int8 import INT8_MAX, to_int8
 from turbopi.tune import portable
-from turbopi.tune.gpu import INVERSE, GpuBench, poisoned, relative
-from turbopi.tune.product_bench import activated
+from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
+from turbopi.tune.product_bench import activated, copied
 from turbopi.tune.race import wrong
 from turbopi.tune.shapes import Call, Operation, Precision, operations
 
@@ -69,13 +69,13 @@ def compiled_as(target: Target) -> Iterator[None]:
 class Int8Product(GpuBench):
     """x @ weightᵀ of int8 with its epilogue, whose sums are exact."""
 
-    copies = 1
-
     def __init__(self, operation: Operation, device: torch.device) -> None:
         super().__init__(operation, device)
         one, kind = operation, operation.operation
         rows = one.columns * (2 if kind == "geglu" else 1)
         self.weight = quantize(self.random(rows, one.inner) / one.inner**0.5, INPUT_SCALE, format=INT8)
+        self.copies = cold_copies(rows * one.inner, device)
+        self.weights = [self.weight, *(copied(self.weight) for _ in range(self.copies - 1))]
         self.bias = self.random(one.columns) if one.bias else None
         self.inverse = INVERSE if one.out_fp8 else None
         self.x = to_int8(self.random(one.rows, one.inner), self.weight.inverse)
@@ -87,7 +87,7 @@ class Int8Product(GpuBench):
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
         epilogue: tiles.Epilogue = self.operation.operation  # type: ignore[assignment]
         tile = tiles.Tile(**knobs)
-        return product(self.x, self.weight, epilogue, self.bias, out, self.inverse, tile, torch.int8)
+        return product(self.x, self.weights[copy], epilogue, self.bias, out, self.inverse, tile, torch.int8)
 
     def out_for(self, knobs: Knobs) -> Tensor | None:
         split = () if knobs["splits"] == 1 else (knobs["splits"],)

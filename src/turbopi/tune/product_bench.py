@@ -55,7 +55,7 @@ class ProductBench(GpuBench):
         self.inverse = INVERSE if one.out_fp8 else None
         first: Matrix = quantize(weight, input_scale) if self.fp8 else weight
         self.copies = cold_copies(weight.numel() * (1 if self.fp8 else 2), device)
-        self.weights = [first, *(_clone(first) for _ in range(self.copies - 1))]
+        self.weights = [first, *(copied(first) for _ in range(self.copies - 1))]
         inverse = first.inverse if isinstance(first, ScaledMatrix) else None
         self.norm_in_front = self._norm(one.norm_in_front, one.inner, inverse)
         self.norm_behind = self._norm(one.norm_behind, one.columns, INVERSE if self.fp8 else None)
@@ -106,5 +106,5 @@ def activated(operation: str, sums: Tensor) -> Tensor:
     return plain.gelu(sums) if operation == "gelu" else plain.geglu(sums) if operation == "geglu" else sums
 
 
-def _clone(matrix: Matrix) -> Matrix:
+def copied(matrix: Matrix) -> Matrix:
     return replace(matrix, data=matrix.data.clone()) if isinstance(matrix, ScaledMatrix) else matrix.clone()
