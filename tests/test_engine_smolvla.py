@@ -81,3 +81,28 @@ def test_keys_and_values_are_the_references(sizes: dict[str, object], cameras: i
 
 def _numpy(x: Tensor) -> np.ndarray:
     return x.float().cpu().numpy()
+
+
+def test_matrices_side_by_side_are_the_models_own() -> None:
+    """They take no memory twice, and stay where a captured graph reads them."""
+    made = model(expert_depth=4).to(DTYPE)
+    before = {name: weight.clone() for name, weight in made.named_parameters()}
+
+    def packed() -> dict[str, Tensor]:
+        vision, prefix = Vision.pack(made, PLAIN, DTYPE), Prefix.pack(made, PLAIN, DTYPE)
+        layers = [layer.qkv[0] for layer in vision.layers]
+        layers += [matrix for layer in prefix.layers for matrix in (layer.qkv, layer.gate_up)]
+        return {f"{i}": matrix for i, matrix in enumerate(layers)}
+
+    def places(tensors: dict[str, Tensor]) -> set[int]:
+        return {one.untyped_storage().data_ptr() for one in tensors.values()}
+
+    matrices = packed()
+    parameters = dict(made.named_parameters())
+    assert places(matrices) <= places(parameters) and len(matrices) == len(places(matrices)) == 10
+    assert {name: one.data_ptr() for name, one in packed().items()} == {n: o.data_ptr() for n, o in matrices.items()}
+    assert all(torch.equal(weight, before[name]) for name, weight in made.named_parameters())
+    own = sum(weight.nbytes for weight in parameters.values())
+    assert (
+        sum({w.untyped_storage().data_ptr(): w.untyped_storage().nbytes() for w in parameters.values()}.values()) == own
+    )

@@ -8,14 +8,14 @@ Shapes: B observations, S places of a prefix with its padding, L layers of the e
 steps, G key heads, K head_dim.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import gcd
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from turbopi.config import GemmaConfig
 from turbopi.engine.forward import HEAD_LAYERS, VisionByOps
@@ -88,12 +88,29 @@ def _affine(module: Any, dtype: torch.dtype) -> Affine:
     return module.weight.to(dtype), module.bias.to(dtype)
 
 
+def _merged(modules: Sequence[nn.Linear], dtype: torch.dtype) -> Tensor:
+    """Their weights one below the other. Of this dtype they lie in there alone from then on, and stay there, as a
+    captured graph may read them.
+    """
+    weights = [one.weight for one in modules]
+    first, rows = weights[0], [len(weight) for weight in weights]
+    ends = [weight.data_ptr() + weight.nbytes for weight in weights]
+    beside = all(weight.data_ptr() == end for weight, end in zip(weights[1:], ends, strict=False))
+    if first.dtype == dtype and beside and len({weight.untyped_storage().data_ptr() for weight in weights}) == 1:
+        return first.detach().as_strided((sum(rows), first.shape[1]), first.stride())
+    whole = torch.cat([weight.detach().to(dtype) for weight in weights])
+    for weight, part in zip(weights, torch.split(whole, rows), strict=True):
+        if weight.dtype == dtype:
+            weight.data = part
+    return whole
+
+
 def _vision_layer(layer: EncoderLayer, dtype: torch.dtype) -> VisionLayer:
     attention, mlp = layer.self_attn, layer.mlp
-    joined = [_affine(one, dtype) for one in (attention.q_proj, attention.k_proj, attention.v_proj)]
+    projections = (attention.q_proj, attention.k_proj, attention.v_proj)
     return VisionLayer(
         norm1=_affine(layer.layer_norm1, dtype),
-        qkv=(torch.cat([weight for weight, _ in joined]), torch.cat([bias for _, bias in joined])),
+        qkv=(_merged(projections, dtype), torch.cat([one.bias.to(dtype) for one in projections])),
         out=_affine(attention.out_proj, dtype),
         norm2=_affine(layer.layer_norm2, dtype),
         fc1=_affine(mlp.fc1, dtype),
@@ -298,13 +315,13 @@ def joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
     read.
     """
     of, mlp = layer.self_attn, layer.mlp
-    q, k, v = (one.weight.to(dtype) for one in (of.q_proj, of.k_proj, of.v_proj))
-    if k.shape[1] != q.shape[1]:
-        k = v = q.new_zeros(k.shape[0], q.shape[1])
+    q = of.q_proj.weight.to(dtype)
+    across = of.k_proj.weight.shape[1] != q.shape[1]
+    none = q.new_zeros(2 * len(of.k_proj.weight), q.shape[1]) if across else q[:0]
     return GemmaLayer(
-        torch.cat((q, k, v)),
+        torch.cat((q, none)) if across else _merged((of.q_proj, of.k_proj, of.v_proj), dtype),
         of.o_proj.weight.to(dtype),
-        torch.cat((mlp.gate_proj.weight, mlp.up_proj.weight)).to(dtype),
+        _merged((mlp.gate_proj, mlp.up_proj), dtype),
         mlp.down_proj.weight.to(dtype),
         layer.input_layernorm.weight.float(),
         layer.post_attention_layernorm.weight.float(),
