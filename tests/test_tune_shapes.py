@@ -187,6 +187,10 @@ def test_smolvlas_operations_are_its_towers_and_its_text_layers() -> None:
     attention = portable["vision attention"]
     assert (attention.rows, attention.columns, attention.inner, attention.images) == (2 * 1024, 12, 64, 2)
     assert operations(BASE.model, Call(2, 48), "fp8", "hopper") == []
-    assert operations(BASE.model, Call(2, 48, 4), "bf16", "hopper") == []
+    four = {one.name: one for one in operations(BASE.model, Call(2, 48, 4), "bf16", "hopper", horizon=50)}
+    assert hopper.keys() < four.keys() and "actions qkv" not in hopper
+    assert four["vision fc1"].rows == 4 * 2 * 1024 and four["prefix down"].rows == 4 * (2 * 64 + 48 + 1)
+    out = four["actions out"]
+    assert (out.rows, out.columns, out.inner, out.uses) == (4 * 50, 720, 960, 10 * 16)
     with pytest.raises(ConfigError, match="Pi0-FAST runs no operations whose tiles can be chosen"):
         operations(PRESETS["pi0_fast_base"].model, Call(2, 48), "bf16", "hopper")

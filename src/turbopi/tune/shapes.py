@@ -114,7 +114,8 @@ def operations(
     Raises ConfigError for a family that has none.
     """
     if isinstance(config, SmolVLAConfig):
-        return [one for one in _smolvla(config, call, precision, kernels) if _has_choice(one)]
+        found = [*_smolvla(config, call, precision, kernels, steps, horizon)]
+        return [one for one in found if _has_choice(one)]
     if not isinstance(config, ModelConfig):
         raise ConfigError(f"{family_of(config).label} runs no operations whose tiles can be chosen")
     found = [*_vision(config, call, precision, kernels), *_prefix(config, call, precision, kernels)]
@@ -164,25 +165,34 @@ def _vision_layers(
     yield replace(usual, name="vision fc2", operation=residual, inner=hidden, norm_behind="layer")
 
 
-def _smolvla(config: SmolVLAConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
-    """Of one observation in bfloat16, which is how it runs. Prompts of all lengths have as many places."""
-    if call.batch > 1 or precision != "bf16":
+def _smolvla(
+    config: SmolVLAConfig, call: Call, precision: Precision, kernels: Kernels, steps: int, horizon: int
+) -> Iterator[Operation]:
+    """In bfloat16, which is how it runs. Prompts of all lengths have as many places."""
+    if precision != "bf16":
         return
     v, text, factor = config.vision, config.text, config.scale_factor**2
-    patches = (config.image_size // v.patch_size) ** 2
-    yield from _vision_layers(v, call.cameras, patches, v.depth, precision, kernels)
-    rows, width, uses = call.cameras * patches // factor, text.width, text.depth - 1
-    yield Operation("projector", kernels, "plain", precision, rows, width, factor * v.width, 1)
+    images, patches = call.cameras * call.batch, (config.image_size // v.patch_size) ** 2
+    yield from _vision_layers(v, images, patches, v.depth, precision, kernels)
+    rows = images * patches // factor
+    yield Operation("projector", kernels, "plain", precision, rows, text.width, factor * v.width, 1)
     around = len(config.image_start) + len(config.image_end)
-    rows += call.cameras * around + config.max_prompt_tokens + 1
+    rows += images * around + call.batch * (config.max_prompt_tokens + 1)
     heads, kv = text.num_heads * text.head_dim, 2 * text.num_kv_heads * text.head_dim
-    usual = Operation("", kernels, "plain", precision, rows, heads + kv, width, uses)
-    normed = replace(usual, norm_in_front="rms")
-    yield replace(normed, name="prefix qkv")
-    yield replace(normed, name="prefix last k, v", columns=kv, uses=1)
-    yield replace(usual, name="prefix out", operation="parts", columns=width, inner=heads, norm_behind="rms")
-    yield replace(normed, name="prefix gate, up", columns=2 * text.mlp_dim)
-    yield replace(usual, name="prefix down", operation="parts", columns=width, inner=text.mlp_dim, norm_behind="rms")
+
+    def layer(part: str, rows: int, width: int, hidden: int, uses: int) -> Iterator[Operation]:
+        usual = Operation("", kernels, "plain", precision, rows, heads + kv, width, uses, batch=call.batch)
+        normed = replace(usual, norm_in_front="rms")
+        yield replace(normed, name=f"{part} qkv")
+        yield replace(usual, name=f"{part} out", operation="parts", columns=width, inner=heads, norm_behind="rms")
+        yield replace(normed, name=f"{part} gate, up", columns=2 * hidden)
+        yield replace(usual, name=f"{part} down", operation="parts", columns=width, inner=hidden, norm_behind="rms")
+
+    qkv, *others = layer("prefix", rows, text.width, text.mlp_dim, text.depth - 1)
+    yield from (qkv, replace(qkv, name="prefix last k, v", columns=kv, uses=1), *others)
+    if call.batch > 1:
+        uses = config.expert_depth * steps
+        yield from layer("actions", call.batch * horizon, config.expert_width, config.expert_mlp, uses)
 
 
 def _image_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:
