@@ -11,6 +11,7 @@ import torch
 from conftest import gpu_or_interpreter
 from smolvla_golden import relative
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
@@ -47,6 +48,7 @@ def model(**sizes: Any) -> SmolVLAModel:
         ({"expert_depth": 4}, 2, 3),
         ({"expert_depth": 2, "image_start": (3, 4), "image_end": (5,)}, 1, 7),
         ({"expert_depth": 2, "self_every": 3}, 1, 1),
+        ({"expert_depth": 4, "self_every": 3}, 2, 5),
         ({"expert_depth": 4, "self_every": None}, 2, 5),
     ],
 )
@@ -73,10 +75,40 @@ def test_keys_and_values_are_the_references(sizes: dict[str, object], cameras: i
     length = torch.tensor([prefix.before_prompt(cameras) + prompt + 1], device=DEVICE)
     x = prefix.embed(embedded, padded, state, length)
     assert len(x) == prefix.places(cameras) and int(length) == int(cache.lengths)
-    keys, values = prefix.of_expert(*prefix.keys_values(x, length))
+    keys, values = prefix.of_expert(prefix.keys_values(x, length))
     for i, (k, v) in enumerate(exact):
         for ours, theirs in ((keys[i], k[0]), (values[i], v[0])):
             assert relative(_numpy(ours[:, : int(length)]), _numpy(theirs)) <= near, i
+
+
+class Made(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Notes the operations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.names.append(function.name().removeprefix("aten::").split(".")[0])
+        return function(*args, **(kwargs or {}))
+
+
+def test_a_second_run_makes_no_table_that_the_first_has_made() -> None:
+    made = model(expert_depth=4)
+    ops = fused_ops(DEVICE) if ON_GPU else replace(portable_ops(), linear_gelu=PLAIN.linear_gelu)
+    vision, prefix = Vision.pack(made, ops, DTYPE), Prefix.pack(made, ops, DTYPE)
+    images, tokens = torch.zeros(1, 16, 16, 3, device=DEVICE), torch.zeros(7, dtype=torch.int64, device=DEVICE)
+    state, length = torch.zeros(1, 32, device=DEVICE), torch.full((1,), 4, device=DEVICE)
+
+    def run() -> list[str]:
+        with Made() as noted:  # type: ignore[no-untyped-call]
+            prefix.of_expert(prefix.keys_values(prefix.embed(vision(images), tokens, state, length), length))
+        return noted.names
+
+    tables = {"arange", "cos", "sin", "pow"}
+    assert tables <= set(run())
+    second = run()
+    assert not tables & set(second) and second.count("embedding") == 1, second  # the prompt's
 
 
 def _numpy(x: Tensor) -> np.ndarray:

@@ -165,13 +165,13 @@ def test_operations_of_several_are_the_reference_alone(which: str) -> None:
     x, lengths = prefix.embed_several(embedded, observation)
     expected = observation.image_mask.sum(1) * prefix.before_prompt(1) + observation.token_mask.sum(1) + 1
     assert torch.equal(lengths, expected)
-    keys, values = prefix.of_expert(*prefix.keys_values(x, lengths))
+    keys, values = prefix.of_expert(prefix.keys_values(x, lengths))
     behind = torch.arange(keys.shape[2]) % (len(x) // 3) >= lengths.repeat_interleave(len(x) // 3)
     keys, values = (one.masked_fill(behind[:, None], torch.nan) for one in (keys, values))  # nobody reads it
     x_t, v_t = torch.full((STEPS + 1, 3, H, 32), torch.nan), torch.full((STEPS, 3, H, 32), torch.nan)
     expert = Expert.pack(made)
     by = ExpertByOps.pack(expert, ops, torch.float32)
-    by.run(expert.mixing(STEPS), keys.contiguous(), values.contiguous(), lengths, noise, x_t, v_t)
+    by.run(by.constants(STEPS, 3, H, len(x) // 3), keys, values, lengths, noise, x_t, v_t)
     assert torch.equal(x_t[0], noise) and v_t.isfinite().all()
     assert relative(x_t[-1].numpy(), alone(made, observation, noise)) <= 1e-5
 

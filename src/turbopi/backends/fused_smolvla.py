@@ -125,13 +125,13 @@ class FusedSmolVLABackend(CapturedBackend):
     def _prefix_stage(self, observation: Observation, embedded: Tensor) -> tuple[KVCache, Any, _Attended]:
         config, prefix, batch = self.config, self._prefix, observation.batch_size
         if batch == 1:
-            lengths = observation.token_mask.sum(1) + prefix.before_prompt(len(embedded)) + 1
+            lengths = observation.token_mask.sum(1) + (prefix.before_prompt(len(embedded)) + 1)
             x = prefix.embed(embedded, observation.tokens[0], observation.state, lengths)
         else:
             x, lengths = prefix.embed_several(embedded, observation)
-        k, v = prefix.keys_values(x, lengths)
-        valid = torch.arange(len(x) // batch, device=self.device)[None] < lengths[:, None]
-        keys, values = (one.contiguous() for one in prefix.of_expert(k, v))
+        k, v = made = prefix.keys_values(x, lengths)
+        keys, values = prefix.of_expert(made)
+        valid = prefix.numbered(batch, len(x) // batch)[0] < lengths[:, None]
 
         def by_row(rows: Tensor) -> Tensor:
             """[layer, G, B * S, K] -> [layer, B, G, S, K]"""
@@ -189,5 +189,7 @@ class FusedSmolVLABackend(CapturedBackend):
         """The same by operations."""
         if self._by_ops is None:
             self._by_ops = ExpertByOps.pack(self._expert, self._ops, self._dtype)
-        by, mixing = self._by_ops, self._expert.mixing(len(chunks[2]))
-        return (by, mixing), lambda: by.run(mixing, attended.keys, attended.values, attended.lengths, *chunks)
+        steps, batch, horizon = chunks[2].shape[:3]
+        by, (_, _, rows, _) = self._by_ops, attended.keys.shape
+        fixed = by.constants(steps, batch, horizon, rows // batch)
+        return (by, fixed), lambda: by.run(fixed, attended.keys, attended.values, attended.lengths, *chunks)

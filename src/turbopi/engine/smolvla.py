@@ -9,7 +9,7 @@ steps, G key heads, K head_dim.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import gcd
 from typing import Any
 
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.config import GemmaConfig
-from turbopi.engine.forward import HEAD_LAYERS, VisionByOps
+from turbopi.engine.forward import HEAD_LAYERS, Rope, VisionByOps
 from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, VisionStream
 from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
@@ -43,25 +43,30 @@ def refusal(config: SmolVLAConfig) -> str | None:
 
 @dataclass(frozen=True)
 class Vision:
-    """SigLIP and the connector."""
+    """SigLIP and the connector.
+
+    positions  [patches, W]: the position table at the grid of an image
+    """
 
     model: SmolVLAModel
     ops: Ops
     layers: list[VisionLayer]
     patch: Affine
+    positions: Tensor
     norm: Affine
     projector: Tensor
 
     @classmethod
     def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Vision":
-        vision = model.vision
+        vision, side = model.vision, model.config.image_size // model.config.vision.patch_size
         weight, bias = _affine(vision.patch_embedding, dtype)
         layers = [_vision_layer(layer, dtype) for layer in vision.layers]  # type: ignore[arg-type]
         norm = _affine(vision.post_layernorm, dtype)
-        return cls(model, ops, layers, (weight.flatten(1), bias), norm, model.projector.weight.to(dtype))
+        positions = vision.positions(side, side).to(dtype)
+        return cls(model, ops, layers, (weight.flatten(1), bias), positions, norm, model.projector.weight.to(dtype))
 
     def __call__(self, images: Tensor, head_ends: Callable[[], None] = lambda: None) -> Tensor:
-        """float32[V, h, w, 3] in [-1, 1] -> [V, T, D of the text layers], unscaled. head_ends: `engine.graph.HEAD`."""
+        """float32[V, S, S, 3] in [-1, 1] -> [V, T, D of the text layers], unscaled. head_ends: `engine.graph.HEAD`."""
         config, ops, (count, height) = self.model.config, self.ops, images.shape[:2]
         vision, by_layer = config.vision, ops.vision or VisionByOps(ops)
         heads, eps = vision.num_heads, vision.layer_norm_eps
@@ -77,11 +82,10 @@ class Vision:
 
     def _embed(self, images: Tensor) -> Tensor:
         """[V, patches, W]"""
-        p, (count, height, width) = self.model.config.vision.patch_size, images.shape[:3]
-        rows, columns = height // p, width // p
-        pixels = normalize_images(images).to(self.projector.dtype).view(count, rows, p, columns, p, 3)
-        patches = pixels.permute(0, 1, 3, 5, 2, 4).reshape(count, rows * columns, 3 * p * p)
-        return F.linear(patches, *self.patch) + self.model.vision.positions(rows, columns).to(pixels.dtype)
+        p, (count, side) = self.model.config.vision.patch_size, images.shape[:2]
+        pixels = normalize_images(images).view(count, side // p, p, side // p, p, 3).permute(0, 1, 3, 5, 2, 4)
+        patches = self.projector.new_empty(pixels.shape).copy_(pixels)  # both in one kernel
+        return F.linear(patches.view(count, -1, 3 * p * p), *self.patch) + self.positions
 
 
 def _affine(module: Any, dtype: torch.dtype) -> Affine:
@@ -125,37 +129,50 @@ def _vision_layer(layer: EncoderLayer, dtype: torch.dtype) -> VisionLayer:
 class Prefix:
     """The text layers, and what the expert's layers across make of their keys and values.
 
-    cross_k, cross_v  [layers across, G K, G K]
+    every   of the expert's layers each so many-th is a self layer, the first of them; 0: none is
+    across  the others, by their places among so many, and their matrices, of keys and then of values [2 layers, G K, G K]
     """
 
     model: SmolVLAModel
     ops: Ops
     layers: list[GemmaLayer[Tensor]]
-    cross_k: Tensor | None
-    cross_v: Tensor | None
+    every: int
+    across: list[tuple[slice, Tensor]]
     special: tuple[Tensor, Tensor]  # embeddings around each image, [start or end tokens, D]
     scale: float  # of images' embeddings
+    _numbered: dict[tuple[int, int], tuple[Tensor, Rope]] = field(default_factory=dict)
 
     @classmethod
     def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Prefix":
-        config, embed = model.config, model.vlm.embed_tokens
-        beside = zip(config.expert_at, model.expert.layers, strict=True)
-        across = [layer.self_attn for at, layer in beside if not config.is_self_layer(at)]
-        cross_k, cross_v = (
-            torch.stack([getattr(one, name).weight.to(dtype).T for one in across]) if across else None
-            for name in ("k_proj", "v_proj")
-        )
+        config, embed, every = model.config, model.vlm.embed_tokens, form(model.config).self_every
+
+        def matrices(its: slice) -> Tensor:
+            of = [layer.self_attn for layer in model.expert.layers[its]]
+            both = [one.k_proj for one in of] + [one.v_proj for one in of]
+            return torch.stack([one.weight.to(dtype).T for one in both])
+
+        others = [slice(first, None, every) for first in range(1, every)] if every else [slice(None)]
+        across = [(its, matrices(its)) for its in others if model.expert.layers[its]]
         start, end = (
             embed(torch.tensor(ids, dtype=torch.int64, device=model.device)).to(dtype)
             for ids in (config.image_start, config.image_end)
         )
         scale = float(torch.tensor(config.text.width**0.5, dtype=dtype))  # rounded, as LeRobot's is
         layers = [joined(layer, dtype) for layer in model.vlm.layers]
-        return cls(model, ops, layers, cross_k, cross_v, (start, end), scale)
+        return cls(model, ops, layers, every, across, (start, end), scale)
 
     def places(self, cameras: int) -> int:
         """S for so many cameras."""
         return self.before_prompt(cameras) + self.model.config.max_prompt_tokens + 1
+
+    def numbered(self, batch: int, places: int) -> tuple[Tensor, Rope]:
+        """int64[S], and RoPE's tables at the places of B prefixes. They are made once, by a graph's first run: what it
+        captures later has none of these kernels.
+        """
+        if (batch, places) not in self._numbered:
+            at = torch.arange(places, device=self.model.device)
+            self._numbered[batch, places] = at, rope_at(at.repeat(batch), self.model.config)
+        return self._numbered[batch, places]
 
     def before_prompt(self, cameras: int) -> int:
         config = self.model.config
@@ -189,43 +206,45 @@ class Prefix:
         """[B, S, D] of [B, V, T, D], [B, max_prompt_tokens] and [B, A], the state's place last."""
         model, batch = self.model, len(tokens)
         start, end = (one.expand(batch, -1, -1) for one in self.special)
-        parts = [part for image in images.unbind(1) for part in (start, image * self.scale, end)]
+        parts = [part for image in (images * self.scale).unbind(1) for part in (start, image, end)]
         prompt = model.vlm.embed_tokens(tokens) * model.config.text.width**0.5
         of_state = model.state_proj(state)[:, None]
         return torch.cat((*parts, prompt.to(images.dtype), of_state.to(images.dtype)), dim=1)
 
-    def keys_values(self, x: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-        """Each text layer's keys, rotated, and values, [layer, G, B * S, K], of embeddings [B * S, D]."""
+    def keys_values(self, x: Tensor, lengths: Tensor) -> Tensor:
+        """Each text layer's keys, rotated, and values, [2, layer, G, B * S, K], of embeddings [B * S, D]."""
         text, ops, batch = self.model.config.text, self.ops, len(lengths)
-        positions = torch.arange(len(x) // batch, device=x.device).repeat(batch)[None]
-        cos, sin = (table[0, 0] for table in rope_tables(positions, text.head_dim, ROPE_BASE))
-        k = x.new_empty(text.depth, text.num_kv_heads, len(x), text.head_dim)
-        v, y, eps = torch.empty_like(k), None, text.rms_norm_eps
+        _, rope = self.numbered(batch, len(x) // batch)
+        k, v = made = x.new_empty(2, text.depth, text.num_kv_heads, len(x), text.head_dim)
+        y, eps = None, text.rms_norm_eps
         for i, layer in enumerate(self.layers):
             x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps)
             last = i + 1 == len(self.layers)  # its keys and values alone are read
             matrix = layer.qkv[-2 * text.num_kv_heads * text.head_dim :] if last else layer.qkv
-            q = rope_grouped(ops.linear(normed, matrix), cos, sin, k[i], v[i])
+            q = rope_grouped(ops.linear(normed, matrix), *rope, k[i], v[i])
             if not last:
                 x, y = behind_attention(ops, layer, x, grouped_attention(q, k[i], v[i], lengths), eps)
-        return k, v
+        return made
 
-    def of_expert(self, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """What each of the expert's layers attends to of them, [L, G, S, K]."""
-        config = self.model.config
-        k, v = k[:: config.expert_every], v[:: config.expert_every]
-        if self.cross_k is None or self.cross_v is None:
-            return k, v
-        own = [config.is_self_layer(at) for at in config.expert_at]
-        return _crossed(k, self.cross_k, own), _crossed(v, self.cross_v, own)
+    def of_expert(self, keys_values: Tensor) -> Tensor:
+        """What each of the expert's layers attends to of them, [2, L, G, B * S, K], contiguous."""
+        cached = keys_values[:, :: self.model.config.expert_every]
+        if not self.across:
+            return cached.contiguous()
+        made = torch.empty_like(cached, memory_format=torch.contiguous_format)
+        if self.every:
+            made[:, :: self.every] = cached[:, :: self.every]
+        for its, matrices in self.across:
+            to = made[:, its].transpose(2, 3)  # [2, layers, B * S, G, K]
+            rows = cached[:, its].transpose(2, 3).reshape(len(matrices), -1, matrices.shape[1])
+            to.copy_((rows @ matrices).view(to.shape))
+        return made
 
 
-def _crossed(cached: Tensor, matrices: Tensor, own: list[bool]) -> Tensor:
-    across = [i for i, stays in enumerate(own) if not stays]
-    _, groups, places, head_dim = cached.shape
-    rows = torch.stack([cached[i] for i in across]).transpose(1, 2).reshape(len(across), places, groups * head_dim)
-    made = iter((rows @ matrices).view(len(across), places, groups, head_dim).transpose(1, 2).unbind(0))
-    return torch.stack([one if stays else next(made) for one, stays in zip(cached.unbind(0), own, strict=True)])
+def rope_at(positions: Tensor, config: SmolVLAConfig) -> Rope:
+    """cos and sin float32[*positions, K/2]"""
+    cos, sin = rope_tables(positions[None], config.text.head_dim, ROPE_BASE)
+    return cos[0, 0], sin[0, 0]
 
 
 def behind_attention(

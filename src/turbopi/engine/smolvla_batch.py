@@ -10,13 +10,27 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.engine.smolvla import Expert, behind_attention, joined
+from turbopi.engine.forward import Rope
+from turbopi.engine.smolvla import Expert, behind_attention, joined, rope_at
 from turbopi.kernels.interface import GemmaLayer, Ops
 from turbopi.kernels.portable.denoise.kernel import Mixing
 from turbopi.kernels.portable.grouped import grouped_suffix_attention, rope_grouped
 from turbopi.models.pi0.denoise import euler_step
-from turbopi.models.pi0.layers import rope_tables
-from turbopi.models.smolvla.config import ROPE_BASE
+
+
+@dataclass(frozen=True)
+class Constants:
+    """Of calls of so many steps, observations, actions and places.
+
+    mixing  its last matrix as the layers' are
+    own     int64[B * H], an action's number, by which it counts in layers across; `across`, their RoPE tables
+    every   RoPE's tables at all positions
+    """
+
+    mixing: Mixing
+    own: Tensor
+    across: Rope
+    every: Rope
 
 
 @dataclass(frozen=True)
@@ -33,32 +47,36 @@ class ExpertByOps:
         layers = [joined(layer, dtype) for layer in expert.model.expert.layers]
         return cls(expert, ops, layers, expert.model.expert.norm.weight.float())
 
+    def constants(self, num_steps: int, batch: int, horizon: int, places: int) -> "Constants":
+        """What `run` reads of such calls that is always the same."""
+        config, dtype = self.expert.model.config, self.layers[0].qkv.dtype
+        mixing = self.expert.mixing(num_steps)
+        mixing = replace(mixing, out=mixing.out.to(dtype), out_bias=mixing.out_bias.to(dtype))
+        own = torch.arange(horizon, device=self.norm.device).repeat(batch)
+        every = rope_at(torch.arange(places + horizon, device=own.device), config)
+        return Constants(mixing, own, rope_at(own, config), every)
+
     def run(
-        self, mixing: Mixing, keys: Tensor, values: Tensor, lengths: Tensor, noise: Tensor, x_t: Tensor, v_t: Tensor
+        self, fixed: "Constants", keys: Tensor, values: Tensor, lengths: Tensor, noise: Tensor, x_t: Tensor, v_t: Tensor
     ) -> None:
         """All steps. What a CUDA graph captures.
 
-        mixing        of so many steps
+        fixed         `constants` of such calls
         keys, values  what each layer attends to [L, G, B * S, K], of which `lengths` int64[B] places are valid
         noise         float32[B, H, A]
         x_t, v_t      to be written, float32[N + 1, B, H, A] and [N, B, H, A]
         """
         batch, horizon = noise.shape[:2]
         x_t[0] = noise
-        own = torch.arange(horizon, device=x_t.device)[None].expand(batch, -1)  # actions count from 0 across
-        ropes = [self._rope(own), self._rope(own + lengths[:, None])]
-        text, dtype = self.expert.model.config.text, keys.dtype
-        mixing = replace(mixing, out=mixing.out.to(dtype), out_bias=mixing.out_bias.to(dtype))
+        behind = (fixed.own.view(batch, horizon) + lengths[:, None]).flatten()
+        ropes = [fixed.across, (fixed.every[0][behind], fixed.every[1][behind])]
+        text = self.expert.model.config.text
         k = keys.new_empty(text.num_kv_heads, batch * horizon, text.head_dim)
         scratch = k, torch.empty_like(k)
         for step in range(len(v_t)):
-            x = self._embed(mixing, step, x_t[step])
+            x = self._embed(fixed.mixing, step, x_t[step])
             v_t[step] = self._velocity(x, ropes, keys, values, lengths, scratch).view_as(v_t[step])
             x_t[step + 1] = euler_step(x_t[step], v_t[step], len(v_t))
-
-    def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        cos, sin = rope_tables(positions, self.expert.model.config.text.head_dim, ROPE_BASE)
-        return cos.flatten(0, -2), sin.flatten(0, -2)
 
     def _embed(self, mixing: Mixing, step: int, x_t: Tensor) -> Tensor:
         """Actions mixed with the time [B * H, D]"""
@@ -68,7 +86,7 @@ class ExpertByOps:
     def _velocity(
         self,
         x: Tensor,
-        ropes: list[tuple[Tensor, Tensor]],
+        ropes: list[Rope],
         keys: Tensor,
         values: Tensor,
         lengths: Tensor,
