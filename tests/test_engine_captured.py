@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from test_engine_batch import observations
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbopi.config import Kind
+from turbopi.engine.flat import Staged
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.solvers import Integration
 
@@ -61,6 +63,19 @@ def test_nothing_captured_asks_the_host(kind: Kind, rows: int, which: str) -> No
     made, noise = observations(kind, [1, 2, 0][:rows], [3, 5, 7][:rows], H)
     engine = on_cpu(kind, Watched)
     assert engine.sample(made, noise, STEPS, conditioning=[reported] * rows).actions.isfinite().all()
+
+
+def test_staged_memory_is_written_again_when_its_copy_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    staged, order = Staged({"x": ((2,), torch.float32), "there": ((3,), torch.bool)}, torch.device("cpu")), []
+    event = SimpleNamespace(synchronize=lambda: order.append("waited"), record=lambda stream: order.append("sent"))
+    monkeypatch.setattr(staged, "_sent", event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    arrays = staged.writable()
+    arrays["x"][:], arrays["there"][1] = 1, True
+    staged.send()
+    staged.writable()["x"][:] = 2
+    assert order == ["waited", "sent", "waited"]
+    assert staged.tensors["x"].tolist() == [1, 1] and staged.tensors["there"].tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(

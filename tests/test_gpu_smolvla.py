@@ -8,10 +8,11 @@ import torch
 from smolvla_golden import GoldenRuns, make_checkpoint, make_hub
 
 from turbopi import UnifiedPolicy
+from turbopi.backends.base import StageTimer
 from turbopi.backends.captured import CapturedBackend
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
-from turbopi.models.observation import Observation
+from turbopi.models.observation import Observation, Past
 from turbopi.models.pi0.conditioning import Conditioning, Guidance
 from turbopi.support.errors import ObservationError
 
@@ -85,6 +86,36 @@ def test_a_conditioned_loop_and_a_batch_equal_the_references(checkpoints: dict[s
     assert all(relative(a["actions"], b["actions"]) <= 2e-5 for a, b in zip(*rows, strict=True))
 
 
+def answer_without_waiting(policy: UnifiedPolicy, conditioning: Conditioning | None) -> None:
+    """A call up to where its actions are read; PyTorch raises for what waits for the device before."""
+    backend, config = policy.backend, policy.backend.config
+    assert isinstance(backend, CapturedBackend)
+    images = [np.full((48, 64, 3), fill, np.uint8) for fill in (20, 200)]
+    inputs = [np.arange(3)], np.zeros((1, config.state_dim), np.float32)
+    noise = np.random.default_rng(1).normal(size=(1, config.action_horizon, config.action_dim)).astype(np.float32)
+    answers = []
+    for mode in ("default", "error"):  # the first call captures
+        torch.cuda.set_sync_debug_mode(mode)
+        try:
+            turn = backend.see([images], "lerobot", [Past()])
+            made = backend.answer(turn, *inputs, noise, 10, conditioning, StageTimer(backend.device))
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        answers.append(made.actions.cpu().numpy())
+    assert np.isfinite(answers[0]).all() and np.array_equal(*answers)
+
+
+@pytest.mark.parametrize("form", ["plain", "held", "pulled"])
+def test_no_captured_call_waits_for_the_device_before_its_actions(
+    checkpoints: dict[str, Checkpoint], form: str
+) -> None:
+    policy = UnifiedPolicy(checkpoints["base"], precision="f32", backend="cuda_graph")
+    target = np.full((10, 32), 0.5, np.float32)
+    guidance = Guidance(target, np.linspace(1, 0, 10, dtype=np.float32), np.ones((10, 10), np.float32), "identity")
+    given = {"held": Conditioning(held=np.arange(10) < 3, values=target), "pulled": Conditioning(guidance=guidance)}
+    answer_without_waiting(policy, given.get(form))
+
+
 @pytest.mark.xfail(strict=True, reason="wrong on an H200, right on CPUs, compiled or not: CapturedBackend.runs_batches")
 def test_a_captured_batch_of_other_prompts_and_cameras_gives_lerobots_actions(
     checkpoints: dict[str, Checkpoint], monkeypatch: pytest.MonkeyPatch
@@ -115,6 +146,10 @@ def policies(published: Checkpoint) -> dict[str, UnifiedPolicy]:
         "ordinary": UnifiedPolicy(published, backend="pytorch"),
         "fused": UnifiedPolicy(published),
     }
+
+
+def test_fused_waits_for_the_device_as_little(policies: dict[str, UnifiedPolicy]) -> None:
+    answer_without_waiting(policies["fused"], None)
 
 
 def seen(policy: UnifiedPolicy, seed: int, cameras: int, prompt: str) -> dict[str, Any]:

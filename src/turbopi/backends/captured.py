@@ -26,6 +26,7 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.config import ImageResize, Network, empty_cameras, memory_of
+from turbopi.engine.flat import Fields, Staged
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.loops import batch_form
 from turbopi.engine.plan import cold_call, split
@@ -63,14 +64,17 @@ class Answer:
 class Graphs:
     """Of so many observations and cameras: the inputs' places, what the prefix leaves, and what is captured behind it.
 
+    staged  all inputs but images and a past
     resizer what the vision graph resizes bytes by; None: it doesn't
     behind  what the reference's expert makes of the cache once a call
     more    what else a backend's prefix leaves
     steps   (horizon, whether each action has its own time) -> step
+    noise   horizon -> float32[B, H, A]
     loops   (horizon, steps) -> a backend's whole loop
     """
 
     inputs: Observation
+    staged: Staged
     resizer: Resizer | None
     vision: Graph
     prefix: Graph
@@ -78,6 +82,7 @@ class Graphs:
     behind: Any
     more: Any
     steps: dict[tuple[int, bool], _Step] = field(default_factory=dict)
+    noise: dict[int, Staged] = field(default_factory=dict)
     loops: dict[tuple[int, int], Any] = field(default_factory=dict)
 
     @property
@@ -253,7 +258,8 @@ class CapturedBackend(PyTorchBackend):
             graphs.resizer.upload([None if one is None or one.dtype == np.float32 else one for one in given], resize)
         if batch > 1:
             there = np.array([one is not None for one in given]).reshape(batch, cameras)
-            graphs.inputs.image_mask.copy_(torch.from_numpy(there))
+            graphs.staged.writable()["image_mask"][:] = there
+            graphs.staged.send()
         for row, past in enumerate(pasts):
             for name, part in past.parts.items():
                 past_of(graphs.inputs).parts[name][row : row + 1, : part.shape[1]].copy_(part)
@@ -275,36 +281,49 @@ class CapturedBackend(PyTorchBackend):
     ) -> Answer:
         """Actions of the observations, the first of so many rows as the graphs have; keep: and all that led to them."""
         graphs: Graphs = turn.graphs
-        self._give_prompts(turn, tokens)
-        graphs.inputs.state[: len(state)].copy_(torch.from_numpy(state))
+        self._give_prompts(turn, tokens, state)
         graphs.prefix.launch()
         timer.mark("prefix")
-        x_1 = torch.zeros(len(graphs.inputs.state), *noise.shape[1:])
-        x_1[: len(noise)] = torch.from_numpy(noise)
-        answer = self._denoise(graphs, x_1.to(self.device), num_steps, conditioning, keep)
+        staged = self._noise(graphs, noise.shape[1])
+        _fill(staged.writable()["noise"], noise)
+        staged.send()
+        answer = self._denoise(graphs, noise.shape[1], num_steps, conditioning, keep)
         timer.mark("denoise")
         return answer
 
-    def _give_prompts(self, turn: Turn, tokens: Sequence[np.ndarray]) -> None:
-        """Put them behind the images that `see` has begun on."""
+    def _give_prompts(
+        self,
+        turn: Turn,
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray | None = None,
+        causal: np.ndarray | None = None,
+    ) -> None:
+        """Put them behind the images that `see` has begun on. causal: as `SeenObservation`'s"""
         if turn is not self._turn:
             raise BackendError("another observation was begun before this one was finished")
-        inputs = turn.graphs.inputs
-        padded = np.zeros((2, *inputs.tokens.shape), np.int64)
+        staged: Staged = turn.graphs.staged
+        arrays = staged.writable()
+        for name in ("tokens", "token_mask", "causal"):
+            arrays[name][:] = 0
         for row, one in enumerate(tokens):
-            padded[0, row, : len(one)], padded[1, row, : len(one)] = one, 1
-        on_device = torch.from_numpy(padded).to(self.device)
-        inputs.tokens.copy_(on_device[0])
-        inputs.token_mask.copy_(on_device[1])
+            arrays["tokens"][row, : len(one)], arrays["token_mask"][row, : len(one)] = one, True
+        if state is not None:
+            _fill(arrays["state"], state)
+        if causal is not None:
+            arrays["causal"][:, : causal.shape[1]] = causal
+        staged.send()
+
+    def _noise(self, graphs: Graphs, horizon: int) -> Staged:
+        if horizon not in graphs.noise:
+            chunks = (graphs.size[1], horizon, self.config.action_dim)
+            graphs.noise[horizon] = Staged({"noise": (chunks, torch.float32)}, self.device)
+        return graphs.noise[horizon]
 
     def _denoise(
-        self,
-        graphs: Graphs,
-        x_1: Tensor,
-        num_steps: int,
-        conditioning: Conditioning | None,
-        keep: bool,
+        self, graphs: Graphs, horizon: int, num_steps: int, conditioning: Conditioning | None, keep: bool
     ) -> Answer:
+        """From the `noise` of the graphs."""
+
         def velocity(x: Tensor, time: Tensor, first: bool) -> tuple[Tensor, Tensor]:
             if self.strict and (x.shape[1], time.ndim == 3) not in graphs.steps:
                 raise self._cold(graphs.size, x.shape[1], conditioned=time.ndim == 3)
@@ -314,7 +333,7 @@ class CapturedBackend(PyTorchBackend):
             step.graph.launch()
             return step.v, step.v.clone()
 
-        grid = self.config.time_grid
+        grid, x_1 = self.config.time_grid, self._noise(graphs, horizon).tensors["noise"]
         with torch.no_grad():
             done = integrate(velocity, self._embed_times, x_1, num_steps, conditioning, grid=grid, keep=keep)
         return Answer(done.actions, [(x, v) for x, _, v in done.evaluations])
@@ -352,18 +371,25 @@ class CapturedBackend(PyTorchBackend):
         """Of several plain observations."""
         self._step(graphs, horizon, by_action=False)
 
-    def _inputs(self, cameras: int, batch: int) -> Observation:
-        config, side, prompt = self.config, self.config.image_size, self.config.max_prompt_tokens
-        return Observation(
-            torch.zeros(batch, cameras, side, side, 3),
-            torch.ones(batch, cameras, dtype=torch.bool),
-            torch.zeros(batch, prompt, dtype=torch.int64),
-            torch.ones(batch, prompt, dtype=torch.bool),
-            torch.zeros(batch, config.state_dim),
-        ).to(self.device)
+    def _inputs(self, cameras: int, batch: int) -> tuple[Observation, Staged]:
+        """Where a graph finds observations, all of whose places are valid at first."""
+        config, side, prompt = self.config, self.config.image_size, (batch, self.config.max_prompt_tokens)
+        fields: Fields = {
+            "image_mask": ((batch, cameras), torch.bool),
+            "tokens": (prompt, torch.int64),
+            "token_mask": (prompt, torch.bool),
+            "state": ((batch, config.state_dim), torch.float32),
+            "causal": (prompt, torch.bool),
+        }
+        staged, images = Staged(fields, self.device), torch.zeros(batch, cameras, side, side, 3, device=self.device)
+        arrays, there = staged.writable(), staged.tensors
+        arrays["image_mask"][:] = arrays["token_mask"][:] = True
+        staged.send()
+        inputs = Observation(images, *(there[name] for name in ("image_mask", "tokens", "token_mask", "state")))
+        return inputs, staged
 
     def _capture(self, cameras: int, batch: int) -> Graphs:
-        inputs = self._inputs(cameras, batch)
+        inputs, staged = self._inputs(cameras, batch)
         if (memory := memory_of(self.config)) is not None:
             inputs = remembering(inputs, memory)
         seen = self._seen(inputs)
@@ -376,7 +402,7 @@ class CapturedBackend(PyTorchBackend):
         second = Graph(prefix, self._pool, self._stream)
         seen.graph.launch()
         second.launch()  # what is captured behind it runs once, and shall find a prefix
-        return Graphs(inputs, seen.resizer, seen.graph, second, *left[0])
+        return Graphs(inputs, staged, seen.resizer, seen.graph, second, *left[0])
 
     def _seen(self, inputs: Observation) -> Seen:
         """The captured vision of observations that lie in `inputs`."""
@@ -397,7 +423,7 @@ class CapturedBackend(PyTorchBackend):
 
     def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> _Step:
         if (horizon, by_action) not in graphs.steps:
-            x = torch.zeros(len(graphs.inputs.state), horizon, self.config.action_dim, device=self.device)
+            x = torch.zeros_like(self._noise(graphs, horizon).tensors["noise"])
             time = self._embed_times(np.ones(1, np.float32))
             time = time[:, None].repeat(1, horizon, 1) if by_action else time.clone()
             made: list[Tensor] = []
@@ -428,6 +454,11 @@ class CapturedBackend(PyTorchBackend):
                 self._times.clear()
             self._times[key] = self._stages.embed_times(times).to(self.device)
         return self._times[key]
+
+
+def _fill(rows: np.ndarray, given: np.ndarray) -> None:
+    """The first ones; the others become zeros."""
+    rows[: len(given)], rows[len(given) :] = given, 0
 
 
 def _parts(cache: KVCache) -> tuple[tuple[str, Tensor], tuple[str, Tensor]]:

@@ -18,6 +18,7 @@ from turbopi.backends.captured import CapturedBackend, Graphs, Seen
 from turbopi.backends.captured_rows import Turn, on_host
 from turbopi.backends.tokens import finished
 from turbopi.config import TextConfig
+from turbopi.engine.flat import Staged
 from turbopi.engine.graph import Graph, Mark
 from turbopi.models.observation import Observation, Past, SeenObservation
 from turbopi.models.pi0.conditioning import Conditionings, of_rows
@@ -105,21 +106,23 @@ class CapturedTextBackend(CapturedBackend):
     def _make_stages(self) -> Any:
         return _Stages(self.model)
 
-    def _inputs(self, cameras: int, batch: int) -> Observation:
-        inputs = super()._inputs(cameras, batch)
-        return SeenObservation.of(inputs, causal=torch.zeros_like(inputs.token_mask)) if self._is_joint else inputs
+    def _inputs(self, cameras: int, batch: int) -> tuple[Observation, Staged]:
+        inputs, staged = super()._inputs(cameras, batch)
+        return SeenObservation.of(inputs, causal=staged.tensors["causal"]) if self._is_joint else inputs, staged
 
     @property
     def _is_joint(self) -> bool:
         return self._text.subtasks is not None and self._text.subtasks.joint
 
-    def _give_prompts(self, turn: Turn, tokens: Sequence[np.ndarray]) -> None:
-        super()._give_prompts(turn, tokens)
-        inputs, causal, self._causal = turn.graphs.inputs, self._causal, None
-        if isinstance(inputs, SeenObservation) and inputs.causal is not None:
-            inputs.causal.zero_()
-            if causal is not None:
-                inputs.causal[:, : causal.shape[1]].copy_(causal)
+    def _give_prompts(
+        self,
+        turn: Turn,
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray | None = None,
+        causal: np.ndarray | None = None,
+    ) -> None:
+        given, self._causal = self._causal, None
+        super()._give_prompts(turn, tokens, state, None if given is None else given.numpy())
 
     def _seen(self, inputs: Observation) -> Seen:
         seen = super()._seen(inputs)

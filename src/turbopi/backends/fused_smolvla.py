@@ -40,9 +40,8 @@ class _Attended:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A captured loop: noise float32[B, H, A], x_t [N + 1, B, H, A], v_t [N, B, H, A], and what it points to."""
+    """A captured loop: x_t float32[N + 1, B, H, A], v_t [N, B, H, A], and what it points to."""
 
-    noise: Tensor
     x_t: Tensor
     v_t: Tensor
     by: Any
@@ -146,15 +145,13 @@ class FusedSmolVLABackend(CapturedBackend):
         return cache, across, _Attended(keys, values, lengths)
 
     def _denoise(
-        self, graphs: Graphs, x_1: Tensor, num_steps: int, conditioning: Conditioning | None, keep: bool
+        self, graphs: Graphs, horizon: int, num_steps: int, conditioning: Conditioning | None, keep: bool
     ) -> Answer:
-        batch, horizon = x_1.shape[:2]
-        if batch == 1 and self._by_step(conditioning):
-            return super()._denoise(graphs, x_1, num_steps, conditioning, keep)
+        if graphs.size[1] == 1 and self._by_step(conditioning):
+            return super()._denoise(graphs, horizon, num_steps, conditioning, keep)
         if self.strict and (horizon, num_steps) not in graphs.loops:
             raise self._cold(graphs.size, horizon)
         loop = self._loop(graphs, horizon, num_steps)
-        loop.noise.copy_(x_1)
         loop.graph.launch()
         return Answer(loop.x_t[-1], list(zip(loop.x_t[:-1].clone(), loop.v_t.clone(), strict=True)) if keep else [])
 
@@ -164,9 +161,8 @@ class FusedSmolVLABackend(CapturedBackend):
     def _loop(self, graphs: Graphs, horizon: int, num_steps: int) -> _Loop:
         if (horizon, num_steps) not in graphs.loops:
             attended: _Attended = graphs.more
-            chunks = (len(attended.lengths), horizon, self.config.action_dim)
-            noise = torch.zeros(chunks, device=self.device)
-            x_t, v_t = noise.new_zeros(num_steps + 1, *chunks), noise.new_zeros(num_steps, *chunks)
+            noise = self._noise(graphs, horizon).tensors["noise"]
+            x_t, v_t = noise.new_zeros(num_steps + 1, *noise.shape), noise.new_zeros(num_steps, *noise.shape)
             with building(self.device), torch.no_grad():
                 by = self._one_denoised if len(attended.lengths) == 1 else self._several_denoised
                 made, launch = by(attended, noise, x_t, v_t)
@@ -176,11 +172,11 @@ class FusedSmolVLABackend(CapturedBackend):
                     mark("denoise")
 
                 graph = Graph(run, self._pool, self._stream)
-            graphs.loops[horizon, num_steps] = _Loop(noise, x_t, v_t, made, graph)
+            graphs.loops[horizon, num_steps] = _Loop(x_t, v_t, made, graph)
         return graphs.loops[horizon, num_steps]
 
     def _one_denoised(self, attended: _Attended, *chunks: Tensor) -> tuple[Any, Callable[[], None]]:
-        """The kernel of all steps, and what launches it. chunks: of a `_Loop`, in their order."""
+        """The kernel of all steps, and what launches it. chunks: noise, x_t and v_t."""
         noise, x_t, v_t = chunks[0][0], chunks[1][:, 0], chunks[2][:, 0]
         kernel = self._make_denoiser(len(v_t), cache_rows=attended.keys.shape[2], suffix=len(noise))
         return kernel, lambda: kernel.launch(noise, attended.keys, attended.values, attended.lengths, x_t, v_t)

@@ -20,6 +20,7 @@ from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.captured_rows import Turn
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
+from turbopi.engine.flat import Staged
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.resize import Resizer
 from turbopi.models import family_of
@@ -143,6 +144,7 @@ class _Graphs:
     """Of so many cameras: the inputs' places, the graphs, the answer, and what `step` captured, with its buffers."""
 
     inputs: Observation
+    staged: Staged
     resizer: Resizer | None
     vision: Graph
     prefix: Graph
@@ -274,7 +276,7 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
 
     def _capture(self, cameras: int, batch: int) -> _Graphs:  # type: ignore[override]
         config = self.config
-        inputs = self._inputs(cameras, batch)
+        inputs, staged = self._inputs(cameras, batch)
         assert self.reader is not None
         decoding = self.model.allocate(inputs, config.max_decoding_steps, self.reader.ends)
         seen = self._seen(inputs)
@@ -290,4 +292,5 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
             mark("denoise")
 
         second, third = Graph(prefix, self._pool, self._stream), Graph(step, self._pool, self._stream)
-        return _Graphs(inputs, seen.resizer, seen.graph, second, third, decoding, one_token, config.action_horizon)
+        own = second, third, decoding, one_token, config.action_horizon
+        return _Graphs(inputs, staged, seen.resizer, seen.graph, *own)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ImageResize
+from turbopi.engine.flat import Staged
 from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
 from turbopi.preprocess.images import WAYS, copy_image, placement
 
@@ -23,10 +24,9 @@ class Resizer:
 
     def __init__(self, images: Tensor) -> None:
         self._images = images
-        on_gpu, self._device = images.is_cuda, images.device
-        self._host = torch.zeros((len(images), len(SOURCE)), dtype=torch.int64, pin_memory=on_gpu)
-        self._rows = self._host.numpy()
-        self.table = torch.zeros_like(self._host, device=self._device)
+        self._device = images.device
+        self._sources = Staged({"table": ((len(images), len(SOURCE)), torch.int64)}, self._device)
+        self._rows, self.table = self._sources.writable()["table"], self._sources.tensors["table"]
         self._staged: list[tuple[Tensor, Tensor] | None] = [None] * len(images)  # bytes on the host and on the device
         self._taps: OrderedDict[tuple[int, int, bool, bool], tuple[Taps, Taps, int, int]] = (
             OrderedDict()
@@ -42,8 +42,8 @@ class Resizer:
             if image is not None:
                 rows[camera] = self._send(camera, image, resize)
         if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
-            self._rows[:] = rows
-            self.table.copy_(self._host, non_blocking=True)
+            self._sources.writable()["table"][:] = rows
+            self._sources.send()
 
     def _send(self, camera: int, image: np.ndarray, resize: ImageResize) -> tuple[int, ...]:
         """A row of the table."""

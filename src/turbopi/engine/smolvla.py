@@ -130,7 +130,7 @@ class Prefix:
     """The text layers, and what the expert's layers across make of their keys and values.
 
     every   of the expert's layers each so many-th is a self layer, the first of them; 0: none is
-    across  the others, by their places among so many, and their matrices, of keys and then of values [2 layers, G K, G K]
+    across  the others, by their places among so many, and their matrices [2 layers, G K, G K], keys' before values'
     """
 
     model: SmolVLAModel

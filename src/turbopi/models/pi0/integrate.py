@@ -118,7 +118,10 @@ def integrate(
     conds = embed_times(distinct)
 
     def on_device(array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(noise.device)
+        host = torch.from_numpy(array)
+        if noise.is_cuda:  # the host needn't wait for the device: PyTorch uses pinned memory again when it was read
+            host = host.contiguous().pin_memory()
+        return host.to(noise.device, non_blocking=True)
 
     solver = None if wanted.integration is None or wanted.integration.is_euler else wanted.integration
     x_t, evaluations = noise, []
