@@ -167,7 +167,8 @@ def test_a_stage_never_runs_without_being_compiled(monkeypatch: pytest.MonkeyPat
     came: list[Any] = []
     compile = torch.compile
 
-    def note(graph: Any, inputs: Any) -> Any:
+    def note(graph: Any, inputs: Any, options: dict[str, Any]) -> Any:
+        assert options == {"comprehensive_padding": False}
         came.append(graph)
         return graph.forward
 
