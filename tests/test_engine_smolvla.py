@@ -85,7 +85,7 @@ class Made(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Notes the operations."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.names: list[str] = []
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -101,7 +101,7 @@ def test_a_second_run_makes_no_table_that_the_first_has_made() -> None:
     state, length = torch.zeros(1, 32, device=DEVICE), torch.full((1,), 4, device=DEVICE)
 
     def run() -> list[str]:
-        with Made() as noted:  # type: ignore[no-untyped-call]
+        with Made() as noted:
             prefix.of_expert(prefix.keys_values(prefix.embed(vision(images), tokens, state, length), length))
         return noted.names
 

@@ -102,7 +102,7 @@ def answer_without_waiting(policy: UnifiedPolicy, conditioning: Conditioning | N
         finally:
             torch.cuda.set_sync_debug_mode("default")
         answers.append(made.actions.cpu().numpy())
-    assert np.isfinite(answers[0]).all() and np.array_equal(*answers)
+    assert np.isfinite(answers[0]).all() and np.array_equal(answers[0], answers[1])
 
 
 @pytest.mark.parametrize("form", ["plain", "held", "pulled"])

@@ -11,7 +11,6 @@ observation hasn't are masked. Those that aren't plain (`Conditioning.form`) run
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,13 +19,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.backends.base import BegunBatch, LoadState, Precision, Sample, StageTimer, Trace
+from turbopi.backends.captured_graphs import Answer, Graphs, Seen, Size, Step, fill, inputs_of, write_prompts
 from turbopi.backends.captured_rows import BegunRows, Images, Turn, on_host
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.backends.pytorch_compile import compiled as compile_stage
 from turbopi.config import ImageResize, Network, empty_cameras, memory_of
-from turbopi.engine.flat import Fields, Staged
+from turbopi.engine.flat import Staged
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.loops import batch_form
 from turbopi.engine.plan import cold_call, split
@@ -38,66 +38,6 @@ from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.preprocess.images import fit_unit
 from turbopi.support.errors import BackendError
 from turbopi.support.toolchain import make_caches_writable
-
-Size = tuple[int, int]  # of a call: cameras and observations
-
-
-@dataclass
-class _Step:
-    """A captured evaluation of the expert: x float32[B, H, A], time float32[1, D] or [1, H, D], v as x."""
-
-    x: Tensor
-    time: Tensor
-    v: Tensor
-    graph: Graph
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Actions float32[B, H, A], on the device; each evaluation's x_t and v_t, of the same shape, if they were kept."""
-
-    actions: Tensor
-    evaluations: list[tuple[Tensor, Tensor]]
-
-
-@dataclass
-class Graphs:
-    """Of so many observations and cameras: the inputs' places, what the prefix leaves, and what is captured behind it.
-
-    staged  all inputs but images and a past
-    resizer what the vision graph resizes bytes by; None: it doesn't
-    behind  what the reference's expert makes of the cache once a call
-    more    what else a backend's prefix leaves
-    steps   (horizon, whether each action has its own time) -> step
-    noise   horizon -> float32[B, H, A]
-    loops   (horizon, steps) -> a backend's whole loop
-    """
-
-    inputs: Observation
-    staged: Staged
-    resizer: Resizer | None
-    vision: Graph
-    prefix: Graph
-    cache: KVCache
-    behind: Any
-    more: Any
-    steps: dict[tuple[int, bool], _Step] = field(default_factory=dict)
-    noise: dict[int, Staged] = field(default_factory=dict)
-    loops: dict[tuple[int, int], Any] = field(default_factory=dict)
-
-    @property
-    def size(self) -> Size:
-        batch, cameras = self.inputs.image_mask.shape
-        return cameras, batch
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A captured vision: what resizes bytes in it (None: nothing does), and the embedded images that it writes."""
-
-    resizer: Resizer | None
-    graph: Graph
-    embedded: Tensor
 
 
 class CapturedBackend(PyTorchBackend):
@@ -138,6 +78,7 @@ class CapturedBackend(PyTorchBackend):
         self._stream: torch.cuda.Stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
         self._times: dict[bytes, Tensor] = {}
         self._turn: Turn | None = None  # of the observations whose images are in the inputs
+        self._causal: Tensor | None = None  # of the prompt that comes next, as `SeenObservation`'s
         self._compiles = PyTorchCompileBackend.unavailable(self.device) is None
         self._embed_images, self._prefix_of, self._velocity = map(self._stage, self._to_compile)
 
@@ -284,40 +225,21 @@ class CapturedBackend(PyTorchBackend):
         self._give_prompts(turn, tokens, state)
         graphs.prefix.launch()
         timer.mark("prefix")
-        staged = self._noise(graphs, noise.shape[1])
-        _fill(staged.writable()["noise"], noise)
+        staged = graphs.noise_of(noise.shape[1], self.config)
+        fill(staged.writable()["noise"], noise)
         staged.send()
         answer = self._denoise(graphs, noise.shape[1], num_steps, conditioning, keep)
         timer.mark("denoise")
         return answer
 
-    def _give_prompts(
-        self,
-        turn: Turn,
-        tokens: Sequence[np.ndarray],
-        state: np.ndarray | None = None,
-        causal: np.ndarray | None = None,
-    ) -> None:
-        """Put them behind the images that `see` has begun on. causal: as `SeenObservation`'s"""
+    def _give_prompts(self, turn: Turn, tokens: Sequence[np.ndarray], state: np.ndarray | None = None) -> None:
+        """Put them behind the images that `see` has begun on."""
         if turn is not self._turn:
             raise BackendError("another observation was begun before this one was finished")
         staged: Staged = turn.graphs.staged
-        arrays = staged.writable()
-        for name in ("tokens", "token_mask", "causal"):
-            arrays[name][:] = 0
-        for row, one in enumerate(tokens):
-            arrays["tokens"][row, : len(one)], arrays["token_mask"][row, : len(one)] = one, True
-        if state is not None:
-            _fill(arrays["state"], state)
-        if causal is not None:
-            arrays["causal"][:, : causal.shape[1]] = causal
+        write_prompts(staged.writable(), tokens, state, self._causal)
         staged.send()
-
-    def _noise(self, graphs: Graphs, horizon: int) -> Staged:
-        if horizon not in graphs.noise:
-            chunks = (graphs.size[1], horizon, self.config.action_dim)
-            graphs.noise[horizon] = Staged({"noise": (chunks, torch.float32)}, self.device)
-        return graphs.noise[horizon]
+        self._causal = None
 
     def _denoise(
         self, graphs: Graphs, horizon: int, num_steps: int, conditioning: Conditioning | None, keep: bool
@@ -333,7 +255,7 @@ class CapturedBackend(PyTorchBackend):
             step.graph.launch()
             return step.v, step.v.clone()
 
-        grid, x_1 = self.config.time_grid, self._noise(graphs, horizon).tensors["noise"]
+        grid, x_1 = self.config.time_grid, graphs.noise_of(horizon, self.config).tensors["noise"]
         with torch.no_grad():
             done = integrate(velocity, self._embed_times, x_1, num_steps, conditioning, grid=grid, keep=keep)
         return Answer(done.actions, [(x, v) for x, _, v in done.evaluations])
@@ -372,21 +294,7 @@ class CapturedBackend(PyTorchBackend):
         self._step(graphs, horizon, by_action=False)
 
     def _inputs(self, cameras: int, batch: int) -> tuple[Observation, Staged]:
-        """Where a graph finds observations, all of whose places are valid at first."""
-        config, side, prompt = self.config, self.config.image_size, (batch, self.config.max_prompt_tokens)
-        fields: Fields = {
-            "image_mask": ((batch, cameras), torch.bool),
-            "tokens": (prompt, torch.int64),
-            "token_mask": (prompt, torch.bool),
-            "state": ((batch, config.state_dim), torch.float32),
-            "causal": (prompt, torch.bool),
-        }
-        staged, images = Staged(fields, self.device), torch.zeros(batch, cameras, side, side, 3, device=self.device)
-        arrays, there = staged.writable(), staged.tensors
-        arrays["image_mask"][:] = arrays["token_mask"][:] = True
-        staged.send()
-        inputs = Observation(images, *(there[name] for name in ("image_mask", "tokens", "token_mask", "state")))
-        return inputs, staged
+        return inputs_of(self.config, cameras, batch, self.device)
 
     def _capture(self, cameras: int, batch: int) -> Graphs:
         inputs, staged = self._inputs(cameras, batch)
@@ -421,9 +329,9 @@ class CapturedBackend(PyTorchBackend):
         graph = Graph(vision, self._pool, self._stream)
         return Seen(resizer, graph, images[0])
 
-    def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> _Step:
+    def _step(self, graphs: Graphs, horizon: int, *, by_action: bool) -> Step:
         if (horizon, by_action) not in graphs.steps:
-            x = torch.zeros_like(self._noise(graphs, horizon).tensors["noise"])
+            x = torch.zeros_like(graphs.noise_of(horizon, self.config).tensors["noise"])
             time = self._embed_times(np.ones(1, np.float32))
             time = time[:, None].repeat(1, horizon, 1) if by_action else time.clone()
             made: list[Tensor] = []
@@ -434,7 +342,7 @@ class CapturedBackend(PyTorchBackend):
 
             with building(self.device), torch.no_grad():
                 graph = Graph(step, self._pool, self._stream)
-            graphs.steps[horizon, by_action] = _Step(x, time, made[1], graph)
+            graphs.steps[horizon, by_action] = Step(x, time, made[1], graph)
         return graphs.steps[horizon, by_action]
 
     def _cold(self, size: Size, horizon: int, *, conditioned: bool = False) -> Exception:
@@ -454,11 +362,6 @@ class CapturedBackend(PyTorchBackend):
                 self._times.clear()
             self._times[key] = self._stages.embed_times(times).to(self.device)
         return self._times[key]
-
-
-def _fill(rows: np.ndarray, given: np.ndarray) -> None:
-    """The first ones; the others become zeros."""
-    rows[: len(given)], rows[len(given) :] = given, 0
 
 
 def _parts(cache: KVCache) -> tuple[tuple[str, Tensor], tuple[str, Tensor]]:

@@ -4,7 +4,7 @@ Beside those of captured.py an observation has two graphs, for so many cameras: 
 any length, with the first id, and "step", one more id (tokens.py). Both prompts use the images that "vision" embedded.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample, StageTimer
-from turbopi.backends.captured import CapturedBackend, Graphs, Seen
+from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.captured_graphs import Graphs, Seen
 from turbopi.backends.captured_rows import Turn, on_host
 from turbopi.backends.tokens import finished
 from turbopi.config import TextConfig
@@ -59,7 +60,6 @@ class CapturedTextBackend(CapturedBackend):
         super().load_weights(load)
         self._texts: dict[int, _TextGraphs] = {}  # by number of cameras
         self._embedded: Tensor | None = None  # of the vision that was captured last
-        self._causal: Tensor | None = None  # of the prompt that comes next
         self._joined: JoinedWeights | None = None
 
     def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
@@ -113,16 +113,6 @@ class CapturedTextBackend(CapturedBackend):
     @property
     def _is_joint(self) -> bool:
         return self._text.subtasks is not None and self._text.subtasks.joint
-
-    def _give_prompts(
-        self,
-        turn: Turn,
-        tokens: Sequence[np.ndarray],
-        state: np.ndarray | None = None,
-        causal: np.ndarray | None = None,
-    ) -> None:
-        given, self._causal = self._causal, None
-        super()._give_prompts(turn, tokens, state, None if given is None else given.numpy())
 
     def _seen(self, inputs: Observation) -> Seen:
         seen = super()._seen(inputs)

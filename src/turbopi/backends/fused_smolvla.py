@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Precision
-from turbopi.backends.captured import Answer, CapturedBackend, Graphs
+from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.captured_graphs import Answer, Graphs
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.qualification import DENOISE, excluded
 from turbopi.backends.tuned_tiles import tiles_of
@@ -161,7 +162,7 @@ class FusedSmolVLABackend(CapturedBackend):
     def _loop(self, graphs: Graphs, horizon: int, num_steps: int) -> _Loop:
         if (horizon, num_steps) not in graphs.loops:
             attended: _Attended = graphs.more
-            noise = self._noise(graphs, horizon).tensors["noise"]
+            noise = graphs.noise_of(horizon, self.config).tensors["noise"]
             x_t, v_t = noise.new_zeros(num_steps + 1, *noise.shape), noise.new_zeros(num_steps, *noise.shape)
             with building(self.device), torch.no_grad():
                 by = self._one_denoised if len(attended.lengths) == 1 else self._several_denoised

@@ -26,9 +26,9 @@ from turbopi.support.toolchain import make_caches_writable, missing_for_c, missi
 # Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
 # 256, beyond which it runs the stage without compiling it
 MOST_VARIANTS, MOST_OF_ALL = 64, 1024
-# Of PyTorch's compiler. A view of a tensor whose strides it pads may read it in another order than it is written in, and
-# numbers are wrong in silence (2.11, and 2.13 by its source; github.com/pytorch/pytorch/pull/192575): so it pads none
-INDUCTOR = {"comprehensive_padding": False}
+# Of PyTorch's compiler. A view of a tensor whose strides it pads may read it in another order than it was written in.
+# Numbers are then wrong, in silence (2.11; 2.13 by its source; github.com/pytorch/pytorch/pull/192575). So it pads none
+INDUCTOR: dict[str, Any] = {"comprehensive_padding": False}
 SWITCHES = ("TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE")  # 1: torch.compile does nothing
 
 
