@@ -116,11 +116,9 @@ def test_no_captured_call_waits_for_the_device_before_its_actions(
     answer_without_waiting(policy, given.get(form))
 
 
-@pytest.mark.xfail(strict=True, reason="wrong on an H200, right on CPUs, compiled or not: CapturedBackend.runs_batches")
 def test_a_captured_batch_of_other_prompts_and_cameras_gives_lerobots_actions(
-    checkpoints: dict[str, Checkpoint], monkeypatch: pytest.MonkeyPatch
+    checkpoints: dict[str, Checkpoint],
 ) -> None:
-    monkeypatch.setattr(CapturedBackend, "runs_batches", True)
     for name in ("base", "missing_camera"):
         policy, golden = UnifiedPolicy(checkpoints[name], precision="f32", backend="cuda_graph"), GoldenRuns(name)
         runs = [run % len(golden) for run in range(3)]

@@ -9,7 +9,6 @@ from replayed_graphs import replay_on_cpu
 from smolvla_golden import relative
 
 from turbopi import UnifiedPolicy
-from turbopi.backends.captured import CapturedBackend
 from turbopi.support.errors import ObservationError
 
 
@@ -43,10 +42,7 @@ def test_captured_calls_in_order_give_lerobots_actions(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_batch_with_memories_is_its_observations_alone(
-    name: str, tmp_path: Path, on_cpu: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(CapturedBackend, "runs_batches", True)  # off, as SmolVLA's are wrong on GPUs
+def test_a_batch_with_memories_is_its_observations_alone(name: str, tmp_path: Path, on_cpu: None) -> None:
     golden = MemoryRuns(name)
     policy = UnifiedPolicy(make_checkpoint(name, tmp_path / name), backend="cuda_graph", precision="f32", device="cpu")
     together, alone = ([policy.new_history() for _ in range(3)] for _ in range(2))

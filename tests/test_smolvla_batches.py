@@ -78,7 +78,6 @@ class FusedOnCpu(FusedSmolVLABackend):
 @pytest.fixture
 def on_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     replay_on_cpu(monkeypatch)
-    monkeypatch.setattr(CapturedBackend, "runs_batches", True)  # off, as GPUs compute them wrongly
     monkeypatch.setattr(fused_smolvla, "Graph", Replayed)
     monkeypatch.setattr(fused_smolvla, "tiles_of", lambda device: Tiles(NO_TILES, BY_MODEL))
     monkeypatch.setattr(fused_smolvla, "excluded", lambda *given: {DENOISE: "it isn't for CPUs"})

@@ -6,8 +6,8 @@ An observation is three kinds of graph for so many cameras: "vision", "prefix", 
 one evaluation of the expert. The loop around the steps is the reference's own (`integrate`), so it takes whatever that
 does but gradients. Images are resized on the device.
 
-Several observations are the same graphs with a row for each, for backends of `runs_batches`: cameras that an
-observation hasn't are masked. Those that aren't plain (`Conditioning.form`) run alone.
+Several observations are the same graphs with a row for each: cameras that an observation hasn't are masked. Those that
+aren't plain (`Conditioning.form`) run alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,8 +48,7 @@ class CapturedBackend(PyTorchBackend):
     forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens")
     writes: ClassVar[bool] = False
     begins: ClassVar[bool] = True
-    # the captured rows were wrong on an H200 (docs/dev/log/batches.md): only a backend with stages of its own has them
-    runs_batches: ClassVar[bool] = False
+    runs_batches: ClassVar[bool] = True
     batch_forms: ClassVar[tuple[Form, ...]] = ()
     # predicted for SmolVLA on an H200 (docs/dev/log/batches.md); a server measures its own
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.15, 4: 1.4, 8: 2}

@@ -55,6 +55,7 @@ class CapturedTextBackend(CapturedBackend):
     """The reference of Pi0.5 in CUDA graphs; a token by the engine's kernels where its sizes are for that."""
 
     writes: ClassVar[bool] = True
+    runs_batches: ClassVar[bool] = False
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(load)

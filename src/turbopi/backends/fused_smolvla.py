@@ -54,7 +54,6 @@ class FusedSmolVLABackend(CapturedBackend):
 
     name: ClassVar[str] = "fused"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
-    runs_batches: ClassVar[bool] = True
     # predicted, as the base's: one observation has the denoising kernel, several don't
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.65, 4: 2.1, 8: 3.05}
     _dtype: ClassVar[torch.dtype] = torch.bfloat16

@@ -168,6 +168,7 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
     """
 
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32", WEIGHTS_ALONE)
+    runs_batches: ClassVar[bool] = False
     _graphs: dict[tuple[int, int], _Graphs]  # type: ignore[assignment]
 
     def load_weights(self, load: LoadState) -> None:
