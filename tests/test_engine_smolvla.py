@@ -2,6 +2,7 @@
 interpreter.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -120,21 +121,17 @@ def test_matrices_side_by_side_are_the_models_own() -> None:
     made = model(expert_depth=4).to(DTYPE)
     before = {name: weight.clone() for name, weight in made.named_parameters()}
 
-    def packed() -> dict[str, Tensor]:
+    def packed() -> list[Tensor]:
         vision, prefix = Vision.pack(made, PLAIN, DTYPE), Prefix.pack(made, PLAIN, DTYPE)
         layers = [layer.qkv[0] for layer in vision.layers]
-        layers += [matrix for layer in prefix.layers for matrix in (layer.qkv, layer.gate_up)]
-        return {f"{i}": matrix for i, matrix in enumerate(layers)}
+        return layers + [matrix for layer in prefix.layers for matrix in (layer.qkv, layer.gate_up)]
 
-    def places(tensors: dict[str, Tensor]) -> set[int]:
-        return {one.untyped_storage().data_ptr() for one in tensors.values()}
+    def places(tensors: Iterable[Tensor]) -> set[int]:
+        return {one.untyped_storage().data_ptr() for one in tensors}
 
-    matrices = packed()
-    parameters = dict(made.named_parameters())
+    matrices, parameters = packed(), list(made.parameters())
     assert places(matrices) <= places(parameters) and len(matrices) == len(places(matrices)) == 10
-    assert {name: one.data_ptr() for name, one in packed().items()} == {n: o.data_ptr() for n, o in matrices.items()}
+    assert [one.data_ptr() for one in packed()] == [one.data_ptr() for one in matrices]
     assert all(torch.equal(weight, before[name]) for name, weight in made.named_parameters())
-    own = sum(weight.nbytes for weight in parameters.values())
-    assert (
-        sum({w.untyped_storage().data_ptr(): w.untyped_storage().nbytes() for w in parameters.values()}.values()) == own
-    )
+    storages = {one.data_ptr(): one.nbytes() for one in (weight.untyped_storage() for weight in parameters)}
+    assert sum(storages.values()) == sum(weight.nbytes for weight in parameters)
