@@ -121,7 +121,7 @@ def test_matrices_side_by_side_are_the_models_own() -> None:
     made = model(expert_depth=4).to(DTYPE)
     before = {name: weight.clone() for name, weight in made.named_parameters()}
 
-    def packed() -> list[Tensor]:
+    def packed() -> list[Any]:
         vision, prefix = Vision.pack(made, PLAIN, DTYPE), Prefix.pack(made, PLAIN, DTYPE)
         layers = [layer.qkv[0] for layer in vision.layers]
         return layers + [matrix for layer in prefix.layers for matrix in (layer.qkv, layer.gate_up)]

@@ -197,9 +197,11 @@ def test_vision_attention_on_hopper(
 
 
 @on_hopper
-@pytest.mark.parametrize(("keys", "warpgroups", "queries"), [(64, 1, 1), (64, 2, 2), (128, 2, 1), (64, 4, 2)])
+@pytest.mark.parametrize(
+    ("keys", "warpgroups", "queries"), [(64, 1, 1), (64, 2, 2), (128, 2, 1), (128, 3, 2), (64, 4, 2)]
+)
 @pytest.mark.parametrize(("heads", "head_dim"), [(4, 16), (16, 72), (2, 24)])
-@pytest.mark.parametrize(("images", "tokens"), [(1, 256), (16, 256), (2, 50), (40, 116)])
+@pytest.mark.parametrize(("images", "tokens"), [(1, 256), (16, 256), (2, 50), (40, 116), (3, 1024)])
 def test_wide_vision_attention_on_hopper(
     heads: int, head_dim: int, images: int, tokens: int, keys: int, warpgroups: int, queries: int
 ) -> None:

@@ -19,8 +19,9 @@ constexpr int BLOCKS = DIM / 8, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
 static_assert(DIM % 8 == 0 && 16 <= DIM && DIM <= 256, "columns that a product may have");
 static_assert(KEYS % 16 == 0 && 16 <= KEYS && KEYS <= 256, "a product with values is 16 keys deep");
 // Registers of a thread, when the producer has given away what it doesn't need
-constexpr int PRODUCER_REGISTERS = WGS == 4 ? 24 : 40, CONSUMER_REGISTERS = WGS == 4 ? 112 : WGS == 1 ? 240 : 232;
-static_assert(WGS == 1 || WGS == 2 || WGS == 4, "setmaxnreg waits for registers that a multiprocessor hasn't");
+constexpr int PRODUCER_REGISTERS = WGS > 2 ? 24 : 40;
+constexpr int CONSUMER_REGISTERS = WGS == 4 ? 112 : WGS == 3 ? 160 : WGS == 1 ? 240 : 232;
+static_assert(1 <= WGS && WGS <= 4, "setmaxnreg waits for registers that a multiprocessor hasn't");
 
 #define NONE __uint_as_float(0xff800000)  // -inf
 

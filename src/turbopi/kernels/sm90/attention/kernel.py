@@ -37,6 +37,9 @@ PARAMETERS = Parameters(
 
 ENOUGH_UNITS = 0.7  # wide ones, by multiprocessor: then they are sooner (docs/dev/log.md, "Attention of batches")
 MOST_OF_FOUR = 72  # columns for which four wide warpgroups have registers
+# Three wide warpgroups: the most columns; the part of the rows that four give the busiest multiprocessor, at most; what a
+# unit takes there that is filled in part.
+MOST_OF_THREE, GAIN_OF_THREE, PARTIAL = 64, 0.85, 0.6
 
 
 @dataclass(frozen=True)
@@ -140,11 +143,21 @@ def _vision_tile(tokens: int, dim: int, groups: int, sms: int) -> AttentionTile:
     for warpgroups in (4, 2):
         tile = AttentionTile(dim, 64, warpgroups, wide=True, queries=2 if dim <= 128 else 1)
         fits = warpgroups == 2 or dim <= MOST_OF_FOUR
-        if fits and groups * -(-tokens // tile.rows) >= ENOUGH_UNITS * sms:
+        if fits and (units := groups * -(-tokens // tile.rows)) >= ENOUGH_UNITS * sms:
+            four = warpgroups == 4 and dim <= MOST_OF_THREE
+            if four and _rows_of_three(tokens, groups, sms) <= GAIN_OF_THREE * -(-units // sms) * tile.rows:
+                return replace(tile, warpgroups=3, keys=128)
             return tile
     tile = AttentionTile(dim, keys=128 if dim <= 128 else 64)
     pair = replace(tile, sharing=2)
     return pair if -(-tokens // 64) % 2 == 0 and pair.holds(tokens) else tile
+
+
+def _rows_of_three(tokens: int, groups: int, sms: int) -> float:
+    """Rows that the busiest CTA of three warpgroups has, where a unit of fewer rows counts for `PARTIAL` of one."""
+    rows = 64 * 3
+    whole, partial = groups * (tokens // rows), groups * (tokens % rows > 0)
+    return rows * max(-(-whole // sms), (whole + PARTIAL * partial) / sms)
 
 
 def _launch(

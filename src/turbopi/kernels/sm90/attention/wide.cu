@@ -5,6 +5,10 @@
 // A warpgroup weighs a tile's logits while its values of the tile before are multiplied, and asks for logits ahead of
 // values, so that the tensor cores have work meanwhile.
 //
+// Three warpgroups' units seldom divide a group's rows: whole units come first, then those that the last rows fill in part,
+// whose other warpgroups multiply nothing. CTAs go through them in turns forth and back, so that who has had fewer whole ones
+// takes more of the rest.
+//
 // TP_PACKED: entries of `segments` are for 64 rows; a unit goes by its first, even one, whose segment is the next one's,
 // too: see `kernels.interface.Segments`.
 
@@ -41,7 +45,17 @@ attention(ATTENTION_PARAMETERS) {
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
     asm volatile("griddepcontrol.wait;" ::: "memory");
 
+    auto next_of = [&](int number) {  // the unit behind one that this CTA has done
+        if (WGS != 3) return number + (int)gridDim.x;
+        const int round = quotient(number, gridDim.x) + 1;
+        return round * (int)gridDim.x + (round & 1 ? (int)gridDim.x - 1 - (int)blockIdx.x : (int)blockIdx.x);
+    };
     auto unit_of = [&](int number) {
+        if (WGS == 3) {
+            const int whole = quotient(rows, ROWS), behind = number - quotient(units, tiles) * whole;
+            const int series = behind < 0 ? quotient(number, whole) : behind;
+            number = series * tiles + (behind < 0 ? number - series * whole : whole);
+        }
         const int series = quotient(number, tiles), group = quotient(series, heads), head = series - group * heads;
         if (!PACKED) return Unit{group, head, (number - series * tiles) * ROWS, rows, 0, keys};
         const int4 segment = segments[2 * number];
@@ -54,7 +68,7 @@ attention(ATTENTION_PARAMETERS) {
         if (threadIdx.x != THREADS) return;
         u32 place = 0, turn = 0;
 #pragma unroll 1
-        for (int number = blockIdx.x; number < units; number += gridDim.x) {
+        for (int number = blockIdx.x; number < units; number = next_of(number)) {
             const Unit unit = unit_of(number);
             if (unit.row >= unit.end_of_rows) continue;
             const u32 slot = turn % QUERIES;
@@ -79,7 +93,7 @@ attention(ATTENTION_PARAMETERS) {
     const int own = threadIdx.x % 128, warp = own / 32;
     u32 place = 0, turn = 0;
 #pragma unroll 1
-    for (int number = blockIdx.x; number < units; number += gridDim.x) {
+    for (int number = blockIdx.x; number < units; number = next_of(number)) {
         const Unit unit = unit_of(number);
         if (unit.row >= unit.end_of_rows) continue;
         const u32 slot = turn % QUERIES, queries = base + (slot * WGS + warpgroup) * Q_BYTES;
@@ -88,6 +102,20 @@ attention(ATTENTION_PARAMETERS) {
         Softmax softmax{scale};
 
         barrier_wait(q_full + 8 * slot, (turn / QUERIES) & 1);
+        if (WGS == 3 && unit.row + 64 * warpgroup >= unit.end_of_rows) {  // others' rows are the last ones
+            if (own == 0) barrier_arrive(q_empty + 8 * slot);
+            for (int left = unit.keys; left > 0; left -= KEYS)
+                for (int values = 0; values < 2; ++values, ++place) {
+                    const u32 tile = ring.await(place);
+                    if (values && left < KEYS) {
+                        clear_rows(tile, left, THREADS);
+                        show_to_products(1, THREADS);
+                    }
+                    ring.release(place);
+                }
+            ++turn;
+            continue;
+        }
         const u32 first = ring.await(place);
         begin_products();
         multiply_keys<Q_PANEL>(logits, queries, first);
