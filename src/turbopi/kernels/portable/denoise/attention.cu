@@ -1,28 +1,9 @@
 // Attention of all query rows over the prefix's and the suffix's keys: a block takes 16 rows and one share of the keys.
 
-constexpr float LOG2_E = 1.4426950408889634f;
-constexpr int LOGIT_STEPS = (HD + 31) / 32;  // 32 columns each
-
-struct Keys {
-  const byte *prefix, *suffix;  // [rows][HD]
-  int length;
-  __device__ __forceinline__ uint4 load(int key, int column, bool there) const {
-    uint4 v = make_uint4(0, 0, 0, 0);
-    if (there && column < HD) {
-      const byte* const row = key < length ? prefix + (long long)key * HD * 2 : suffix + (key - length) * HD * 2;
-      v = load_shared_by_grid(row + column * 2);
-    }
-    return v;
-  }
-};
-
 // What a warp reads first of its share: asked for before the barrier, as far as it is the prefix's. The rest, of the
 // suffix, comes behind it.
 struct First {
-  uint4 keys[KEYS_AHEAD][LOGIT_STEPS], values[VALUES_AHEAD][4];
-};
-struct Queries {  // of a lane: rows g and g + 8 of the tile
-  uint4 low[LOGIT_STEPS], high[LOGIT_STEPS];
+  uint4 keys[LOGIT_STEPS], values[4];
 };
 __device__ __forceinline__ int key_of(int thread, int tile) { return tile * 8 + thread % 32 / 4; }
 __device__ __forceinline__ int value_of(int thread, int step, int i) { return step * 16 + thread % 4 * 2 + i % 2 + i / 2 * 8; }
@@ -31,24 +12,17 @@ __device__ __forceinline__ int value_column(int thread) { return thread / 32 % D
 template <bool PREFIX>
 __device__ __forceinline__ void ask_first(int thread, First& first, const Keys& keys, const Keys& values, int begin, int count) {
   const int group = thread / 32 / DIM_GROUPS;
+  const int key = key_of(thread, thread / 32);
+  if (PREFIX || (begin + key >= keys.length && key < count))
 #pragma unroll
-  for (int n = 0; n < KEYS_AHEAD; ++n) {
-    const int key = key_of(thread, thread / 32 + n * WARPS);
-    if (PREFIX || (begin + key >= keys.length && key < count))
+    for (int i = 0; i < LOGIT_STEPS; ++i)
+      first.keys[i] = keys.load(begin + key, i * 32 + thread % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
 #pragma unroll
-      for (int i = 0; i < LOGIT_STEPS; ++i)
-        first.keys[n][i] =
-            keys.load(begin + key, i * 32 + thread % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
+  for (int i = 0; i < 4; ++i) {
+    const int at = value_of(thread, group, i);
+    if (PREFIX || (begin + at >= keys.length && at < count))
+      first.values[i] = values.load(begin + at, value_column(thread), at < count && (!PREFIX || begin + at < keys.length));
   }
-#pragma unroll
-  for (int n = 0; n < VALUES_AHEAD; ++n)
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      const int at = value_of(thread, group + n * KEY_GROUPS, i);
-      if (PREFIX || (begin + at >= keys.length && at < count))
-        first.values[n][i] =
-            values.load(begin + at, value_column(thread), at < count && (!PREFIX || begin + at < keys.length));
-    }
 }
 
 // The queries of a row tile, to shared memory.
@@ -62,21 +36,8 @@ __device__ __forceinline__ void take_queries(int thread, const Args& args, float
   }
 }
 
-// The same without a way through shared memory, where each warp has few of them.
-__device__ __forceinline__ void ask_queries(int thread, const Args& args, Queries& queries, int row_tile) {
-  const int row = row_tile % HEAD_ROW_TILES * 16 + thread % 32 / 4;
-  const byte* const from = args.queries + (row_tile / HEAD_ROW_TILES * ROWS + row) * HD * 2 + thread % 4 * 16;
-#pragma unroll
-  for (int i = 0; i < LOGIT_STEPS; ++i) {
-    queries.low[i] = queries.high[i] = make_uint4(0, 0, 0, 0);
-    const bool there = i * 32 + thread % 4 * 8 < HD;
-    if (there && row < ROWS) queries.low[i] = load_shared_by_grid(from + i * 64);
-    if (there && row + 8 < ROWS) queries.high[i] = load_shared_by_grid(from + 8 * HD * 2 + i * 64);
-  }
-}
-
-__device__ __forceinline__ void logits(int thread, const Args& args, float* smem, const First& first, const Queries& asked,
-                                       const Keys& keys, int begin, int count) {
+__device__ __forceinline__ void logits(int thread, const Args& args, float* smem, const First& first, const Keys& keys, int begin,
+                                       int count) {
   const int warp = thread / 32, lane = thread % 32, g = lane / 4, t = lane % 4;
   const float* const queries = smem + S_QUERIES + g * QUERIES_ROW + t * 4;
   auto multiply = [&](int tile, const uint4(&k)[LOGIT_STEPS]) {
@@ -84,9 +45,7 @@ __device__ __forceinline__ void logits(int thread, const Args& args, float* smem
 #pragma unroll
     for (int i = 0; i < LOGIT_STEPS; ++i) {
       uint4 low = make_uint4(0, 0, 0, 0), high = low;
-      if (ALL_AHEAD) {
-        low = asked.low[i], high = asked.high[i];
-      } else if (i * 32 + t * 8 < HD) {
+      if (i * 32 + t * 8 < HD) {
         low = *(const uint4*)(queries + i * 16), high = *(const uint4*)(queries + i * 16 + 8 * QUERIES_ROW);
       }
       mma(c, low.x, high.x, low.y, high.y, k[i].x, k[i].y);
@@ -97,10 +56,7 @@ __device__ __forceinline__ void logits(int thread, const Args& args, float* smem
     *(float2*)to = make_float2(c[0] * by, c[1] * by);
     *(float2*)(to + 8 * LOGITS_ROW) = make_float2(c[2] * by, c[3] * by);
   };
-#pragma unroll
-  for (int n = 0; n < KEYS_AHEAD; ++n)
-    if ((warp + n * WARPS) * 8 < count) multiply(warp + n * WARPS, first.keys[n]);
-  if (ALL_AHEAD) return;
+  if (warp * 8 < count) multiply(warp, first.keys);
 #pragma unroll 1
   for (int tile = warp + WARPS; tile * 8 < count; tile += WARPS) {
     uint4 k[LOGIT_STEPS];
@@ -121,30 +77,12 @@ __device__ __forceinline__ void softmax(int thread, const Args& args, float* sme
     float top = -infinity(), sum = 0;
     const int token = (share / SPLITS % HEAD_ROW_TILES * 16 + row) / GROUP;
     const int seen = CAUSAL ? max(min(count, own + token + 1), 0) : count;
-    if (ALL_AHEAD) {  // a lane's keys at once
-      constexpr int MINE = (SPLIT_KEYS + 31) / 32;
-      float mine[MINE];
-#pragma unroll
-      for (int i = 0; i < MINE; ++i) {
-        mine[i] = i * 32 + lane < seen ? from[i * 32 + lane] : -infinity();
-        top = fmaxf(top, mine[i]);
-      }
-#pragma unroll
-      for (int by = 16; by; by /= 2) top = fmaxf(top, __shfl_xor_sync(~0u, top, by));
-#pragma unroll
-      for (int i = 0; i < MINE; ++i) {
-        const u32 weight = i * 32 + lane < seen ? pack(exp2f(mine[i] - top), 0) : 0;
-        if (i * 32 + lane < SPLIT_KEYS) to[i * 32 + lane] = weight;
-        sum += low_of(weight);
-      }
-    } else {
     for (int key = lane; key < seen; key += 32) top = fmaxf(top, from[key]);
 #pragma unroll
     for (int by = 16; by; by /= 2) top = fmaxf(top, __shfl_xor_sync(~0u, top, by));
     for (int key = lane; key < (count + 15) / 16 * 16; key += 32) {
       const u32 weight = key < seen ? pack(exp2f(from[key] - top), 0) : 0;
       to[key] = weight, sum += low_of(weight);
-    }
     }
 #pragma unroll
     for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
@@ -177,15 +115,13 @@ __device__ __forceinline__ void weigh(int thread, float* smem, const First& firs
     }
   };
   Row rows[4];
+  if (group * 16 < count) {
 #pragma unroll
-  for (int n = 0; n < VALUES_AHEAD; ++n)
-    if ((group + n * KEY_GROUPS) * 16 < count) {
-#pragma unroll
-      for (int i = 0; i < 4; ++i) rows[i].all = first.values[n][i];
-      multiply(group + n * KEY_GROUPS, rows);
-    }
+    for (int i = 0; i < 4; ++i) rows[i].all = first.values[i];
+    multiply(group, rows);
+  }
 #pragma unroll(WARPS > 8 ? 1 : 3)
-  for (int step = group + KEY_GROUPS; !ALL_AHEAD && step * 16 < count; step += KEY_GROUPS) {
+  for (int step = group + KEY_GROUPS; step * 16 < count; step += KEY_GROUPS) {
 #pragma unroll
     for (int i = 0; i < 4; ++i) rows[i].all = values.load(begin + value_of(thread, step, i), value_column(thread), value_of(thread, step, i) < count);
     multiply(step, rows);
@@ -238,14 +174,9 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
       ask_first<true>(thread, first, keys, values, begin, count);
     }
     ask_first<false>(thread, first, keys, values, begin, count);
-    Queries queries;
-    if (ALL_AHEAD) {
-      ask_queries(thread, args, queries, share / SPLITS);
-    } else {
-      take_queries(thread, args, smem, share / SPLITS);
-      __syncthreads();
-    }
-    logits(thread, args, smem, first, queries, keys, begin, count);
+    take_queries(thread, args, smem, share / SPLITS);
+    __syncthreads();
+    logits(thread, args, smem, first, keys, begin, count);
     __syncthreads();
     softmax(thread, args, smem, share, count, length - begin);
     __syncthreads();

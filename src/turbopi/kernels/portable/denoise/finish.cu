@@ -19,26 +19,27 @@ __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) 
   }
 }
 
-// The same in front of a product. Of a narrow stream some threads have a token: their loads go in front of the product's, and
-// few sums cross lanes.
+// The same in front of a product. Of a narrow stream some threads have a token of the block's range: their loads go in front
+// of the product's, and few sums cross lanes.
+template <class S>
 struct InverseRms {
   static constexpr bool NARROW = !MODULATED && D_TILES % 2 == 0;
-  static constexpr int SHARING = THREADS >= 512 ? 8 : THREADS >= 256 ? 4 : 2;  // threads of a token
+  static constexpr int SHARING = power_of_two(THREADS / S::RANGE, 32);  // threads of a token
   static constexpr int LOADS = NARROW ? (D_TILES / 2 + SHARING - 1) / SHARING : 1;
   const Args& args;
   float* smem;
   float2 of[LOADS];
-  __device__ __forceinline__ void ask(int thread) {
+  __device__ __forceinline__ void ask(int thread, int from) {
     if (!NARROW) return;
     const int token = thread / SHARING, mine = thread % SHARING;
 #pragma unroll
     for (int i = 0; i < LOADS; ++i) {
       of[i] = make_float2(0, 0);
-      if (token < T && (i * SHARING + mine) * 2 < D_TILES)
-        of[i] = __ldcg((const float2*)(args.squares + token * D_TILES) + i * SHARING + mine);
+      if (token < S::RANGE && from + token < T && (i * SHARING + mine) * 2 < D_TILES)
+        of[i] = __ldcg((const float2*)(args.squares + (from + token) * D_TILES) + i * SHARING + mine);
     }
   }
-  __device__ __forceinline__ void make(int thread) {
+  __device__ __forceinline__ void make(int thread, int from) {
     if (!NARROW) {
       make_inverse_rms(args, smem);
       return;
@@ -48,12 +49,13 @@ struct InverseRms {
     for (int i = 0; i < LOADS; ++i) sum += of[i].x + of[i].y;
 #pragma unroll
     for (int by = SHARING / 2; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
-    if (thread / SHARING < T && thread % SHARING == 0) smem[S_RMS + thread / SHARING] = rsqrtf(sum / D + args.eps);
+    const int token = from + thread / SHARING;
+    if (thread / SHARING < S::RANGE && token < T && thread % SHARING == 0) smem[S_RMS + token] = rsqrtf(sum / D + args.eps);
   }
 };
 struct Nothing {
-  __device__ __forceinline__ void ask(int) const {}
-  __device__ __forceinline__ void make(int) const {}
+  __device__ __forceinline__ void ask(int, int) const {}
+  __device__ __forceinline__ void make(int, int) const {}
 };
 
 // Sums of the stream behind a norm: times 1 / rms (of eight bits, and the channel's scale), plus the shift's product.

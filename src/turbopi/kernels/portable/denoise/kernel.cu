@@ -16,7 +16,7 @@
 // qkv: product.run; arrive
 //   guards   stream and squares, of embed or down
 // attention: attend; arrive
-//   guards   queries, keys, values
+//   guards   queries, keys, values. Of narrow heads `attend_by_warps`, which waits as `attend` does
 // combine: wait; combine; arrive
 //   guards   partial, tops. Where a row has several shares of the keys
 // out: product.run; arrive
@@ -38,11 +38,15 @@
 //   guards   sums in S_WORK: read before the next pass writes; written before they are added up, and S_RMS with them
 // attend: 5
 //   guards   S_QUERIES; logits; S_WEIGHTS; S_OUT; all of them, before the next share
+// attend_eight: 1
+//   guards   parts of warps, and what they found: written before they are put together
+// attend_by_warps: 1
+//   guards   the same, before the next rows
 
 // action_in_proj of x_t, and the stream of the first norm: each block the columns that it keeps. Where the time is mixed
 // into the tokens, the hidden units of that MLP: its first matrix is multiplied with action_in_proj already.
 __device__ __forceinline__ void embed(const Args& args, const Stream& into, const float* x_t, const float* bias) {
-  const Product<DownShape> mine(args.weights);
+  const Product<EmbedShape> mine(args.weights);
   const int tiles = mine.end - mine.first, lane = threadIdx.x % 32;
   for (int index = threadIdx.x; index - lane < tiles * T * 4; index += THREADS) {
     Item i{mine.first + index / (4 * T), index / 4 % T, index % 4, index < tiles * T * 4};
@@ -157,7 +161,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
   Grid grid(args);
   const int length = *args.length;
   Nothing nothing;
-  InverseRms inverse_rms{args, smem};
   for (int step = 0; step < args.steps; ++step) {
     const float* const table = args.table + (MODULATED ? (long long)step * (2 * L + 1) * 3 * D : 0);
     Stream stream{table, args.x, args.squares, args.stream};
@@ -186,12 +189,16 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
                          (unsigned short*)args.queries,
                          (unsigned short*)args.keys,
                          (unsigned short*)args.values};
+        InverseRms<QkvShape> inverse_rms{args, smem};
         product.run(grid, smem, args.stream, finish, inverse_rms);
       }
       grid.arrive();
       ahead<GateUpShape>(weights + GATE_UP_AT);
       const float attended_times = FP8 ? __ldg(args.attended_times + layer) : 1.0f;
-      attend(grid, args, smem, layer, length, attended_times);
+      if (BY_WARPS)
+        attend_by_warps(grid, args, smem, layer, length, attended_times);
+      else
+        attend(grid, args, smem, layer, length, attended_times);
       grid.arrive();
       if (COMBINES) {
         grid.wait();
@@ -213,6 +220,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
         ahead<QkvShape>(next + QKV_AT);
         cache_ahead(args, layer + 1 < L ? layer + 1 : 0, length);
         FinishGateUp finish{{shifted + QKV_ROWS, scales + (SCALED ? QKV_ROWS : 0), smem + S_RMS}, args.hidden};
+        InverseRms<GateUpShape> inverse_rms{args, smem};
         product.run(grid, smem, args.stream, finish, inverse_rms);
       }
       grid.arrive();

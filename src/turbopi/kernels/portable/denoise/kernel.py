@@ -35,7 +35,7 @@ from turbopi.kernels.portable.denoise.packing import (
 )
 from turbopi.support.errors import BackendUnavailable
 
-PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
+PARTS = ("primitives", "product", "finish", "attention_by_warps", "attention", "kernel")  # behind sizes.cu and Args
 MAX_SUFFIX = 64
 SHARED_BYTES = 99 * 1024  # what a block has on every GPU from 8.0 on
 MAX_SPLITS, MAX_SPLIT_KEYS = 16, 256  # shares of the keys: as many as are combined at once; what fits a block
@@ -55,18 +55,19 @@ class Choices:
     weights: int  # loads of 16 bytes that a lane has on their way, at most
     activations: int  # the same of activations, in groups of 8 tokens
     ahead: bool  # weights of later phases go to L2, where L2 is large
+    ranges: int = 1  # of tokens: a block has tiles of a product for one of them
 
 
 FEW = Choices(warps=16, sums=8, weights=8, activations=8, ahead=True)  # up to 16 tokens
 MANY = Choices(warps=8, sums=16, weights=8, activations=14, ahead=True)
 
 
-NARROW = Choices(warps=16, sums=8, weights=8, activations=7, ahead=True)  # of SmolVLA's width
+NARROW = Choices(warps=16, sums=8, weights=12, activations=8, ahead=True, ranges=2)  # of SmolVLA's width
 
 
 def choices(suffix: int, form: Form = PI05) -> Choices:
     if not form.modulated:
-        return NARROW
+        return NARROW if suffix > 16 else replace(NARROW, ranges=1)
     return FEW if suffix <= 16 else MANY
 
 
@@ -145,6 +146,7 @@ def kernel_sizes(
         "TP_SUMS": max(choice.sums, -(-suffix // 16)),
         "TP_WEIGHTS_IN_FLIGHT": choice.weights,
         "TP_ACTIVATIONS_IN_FLIGHT": choice.activations,
+        "TP_RANGES": choice.ranges,
         "TP_AHEAD": int(choice.ahead),
         "TP_KV_HEADS": g.num_kv_heads,
         "TP_CACHE_ROWS": cache_rows if g.num_kv_heads > 1 else 0,

@@ -15,8 +15,8 @@ struct Item {
 
 // Tiles are shared out evenly: a block's first one.
 template <class S>
-__device__ __forceinline__ int first_tile(int block, int tiles = S::TILES) {
-  return (long long)tiles * block / BLOCKS;
+__device__ __forceinline__ int first_tile(int block, int tiles = S::TILES, int blocks = BLOCKS) {
+  return (long long)tiles * block / blocks;
 }
 
 template <class S>
@@ -29,9 +29,12 @@ struct Product {
   // tiles: the first ones alone
   __device__ __forceinline__ explicit Product(const byte* all, int tiles = S::TILES) : thread(thread_of_phase()) {
     weights = all + thread % 32 * 16;
-    const int block = block_of_phase();
-    first = first_tile<S>(block, tiles), end = first_tile<S>(block + 1, tiles);
+    const int block = block_of_phase(), party = block / S::RANGES;
+    first = first_tile<S>(party, tiles, S::PARTIES), end = first_tile<S>(party + 1, tiles, S::PARTIES);
+    if (S::LEFT_OUT && party == S::PARTIES) end = first;
   }
+  // The first token. A member that is 0 costs sm_80's kernels registers
+  __device__ __forceinline__ int from() const { return S::RANGES > 1 ? blockIdx.x % S::RANGES * S::RANGE : 0; }
   __device__ __forceinline__ int first_chunk() const { return thread / 32 / S::WN * S::WARP_CHUNKS; }
   // Load number n of a lane, counted over all passes.
   __device__ __forceinline__ uint4 load(int pass, int n) const {
@@ -47,24 +50,24 @@ struct Product {
 #pragma unroll
     for (int n = 0; n < S::IN_FLIGHT; ++n) w[n] = load(0, n);
   }
-  __device__ __forceinline__ void load_chunk(uint4 (&a)[GROUPS][PIECES], const byte* activation, int chunk) const {
+  __device__ __forceinline__ void load_chunk(uint4 (&a)[S::GROUPS][PIECES], const byte* activation, int chunk) const {
     const int lane = thread % 32, at = first_chunk() + chunk;
     const bool there = S::CHUNKS % S::WK == 0 || at < S::CHUNKS;
 #pragma unroll
-    for (int group = 0; group < GROUPS; ++group) {
-      const int token = group * 8 + lane / 4;
+    for (int group = 0; group < S::GROUPS; ++group) {
+      const int token = from() + group * 8 + lane / 4;
 #pragma unroll
       for (int piece = 0; piece < PIECES; ++piece) {
         a[group][piece] = make_uint4(0, 0, 0, 0);
-        if (there && token < T)
+        if (there && token < T && (S::RANGES == 1 || token < from() + S::RANGE))
           a[group][piece] = load_shared_by_grid(activation + ((at * T + token) * PIECES + piece) * 64 + lane % 4 * 16);
       }
     }
   }
   __device__ __forceinline__ Item item(int pass, int index) const {
-    const int tile = index / (4 * T);
-    Item i{first + pass * S::PASS_TILES + tile, index / 4 % T, index % 4, false};
-    i.valid = tile < S::PASS_TILES && i.tile < end;
+    const int tile = index / (4 * S::RANGE);
+    Item i{first + pass * S::PASS_TILES + tile, from() + index / 4 % S::RANGE, index % 4, false};
+    i.valid = tile < S::PASS_TILES && i.tile < end && (T % S::RANGES == 0 || i.token < T);
     return i;
   }
 
@@ -75,20 +78,20 @@ struct Product {
     Item mine = item(0, thread);
     auto factors = finish.factors(mine);
     grid.wait();
-    if (S::TILES < BLOCKS && first == end) return;  // it would load all activations for nothing
-    meanwhile.ask(thread);
-    uint4 a[S::A_IN_FLIGHT][GROUPS][PIECES];
+    if ((S::TILES < S::PARTIES || S::LEFT_OUT) && first == end) return;  // it would load all activations for nothing
+    meanwhile.ask(thread, from());
+    uint4 a[S::A_IN_FLIGHT][S::GROUPS][PIECES];
     for (int pass = 0; pass < S::PASSES; ++pass) {
       if (S::PASSES > 1) thread = of_phase(thread), first = of_phase(first), end = of_phase(end);
       if (pass == 0 || S::A_IN_FLIGHT < S::WARP_CHUNKS) {
 #pragma unroll
         for (int chunk = 0; chunk < S::A_IN_FLIGHT; ++chunk) load_chunk(a[chunk], activation, chunk);
       }
-      if (pass == 0) meanwhile.make(thread);
-      float c[S::WARP_TILES][M_TILES][4] = {};
+      if (pass == 0) meanwhile.make(thread, from());
+      float c[S::WARP_TILES][S::M_TILES][4] = {};
 #pragma unroll
       for (int chunk = 0; chunk < S::WARP_CHUNKS; ++chunk) {
-        uint4(&here)[GROUPS][PIECES] = a[chunk % S::A_IN_FLIGHT];
+        uint4(&here)[S::GROUPS][PIECES] = a[chunk % S::A_IN_FLIGHT];
 #pragma unroll
         for (int tile = 0; tile < S::WARP_TILES; ++tile) {
           const int n = chunk * S::WARP_TILES + tile, next = n + S::IN_FLIGHT;
@@ -96,9 +99,9 @@ struct Product {
           for (int piece = 0; piece < PIECES; ++piece) {
             const uint4 b = piece_of_weights(w[n % S::IN_FLIGHT], piece);
 #pragma unroll
-            for (int m = 0; m < M_TILES; ++m) {
+            for (int m = 0; m < S::M_TILES; ++m) {
               const uint4 none = make_uint4(0, 0, 0, 0);
-              const uint4 high = 2 * m + 1 < GROUPS ? here[2 * m + 1 < GROUPS ? 2 * m + 1 : 0][piece] : none;
+              const uint4 high = 2 * m + 1 < S::GROUPS ? here[2 * m + 1 < S::GROUPS ? 2 * m + 1 : 0][piece] : none;
               mma_chunk(c[tile][m], here[2 * m][piece], high, b);
             }
           }
@@ -114,22 +117,24 @@ struct Product {
 #pragma unroll
       for (int tile = 0; tile < S::WARP_TILES; ++tile)
 #pragma unroll
-        for (int half = 0; half < GROUPS; ++half) {
+        for (int half = 0; half < S::GROUPS; ++half) {
+          if (half * 8 + 8 > S::SUM_ROWS && half * 8 + lane / 4 >= S::SUM_ROWS) continue;
           const int at = warp / S::WN * S::PASS_TILES + warp % S::WN * S::WARP_TILES + tile;
           const float(&of)[4] = c[tile][half / 2];
-          *(float2*)(sums + (at * GROUPS * 8 + half * 8 + lane / 4) * 8 + lane % 4 * 2) =
+          *(float2*)(sums + (at * S::SUM_ROWS + half * 8 + lane / 4) * 8 + lane % 4 * 2) =
               half % 2 ? make_float2(of[2], of[3]) : make_float2(of[0], of[1]);
         }
       __syncthreads();
 #pragma unroll 1
-      for (int index = thread; index - lane < S::PASS_TILES * T * 4; index += THREADS) {
+      for (int index = thread; index - lane < S::PASS_TILES * S::RANGE * 4; index += THREADS) {
         if (pass > 0 || index >= THREADS) mine = item(pass, index), factors = finish.factors(mine);
         float2 sum = make_float2(0, 0);
         if (mine.valid) {
-          const float* const of = sums + ((mine.tile - first - pass * S::PASS_TILES) * GROUPS * 8 + mine.token) * 8 + mine.pair * 2;
+          const int row = (mine.tile - first - pass * S::PASS_TILES) * S::SUM_ROWS + mine.token - from();
+          const float* const of = sums + row * 8 + mine.pair * 2;
 #pragma unroll
           for (int k = 0; k < S::WK; ++k) {
-            const float2 part = *(const float2*)(of + k * S::PASS_TILES * GROUPS * 64);
+            const float2 part = *(const float2*)(of + k * S::PASS_TILES * S::SUM_ROWS * 8);
             sum.x += part.x, sum.y += part.y;
           }
         }

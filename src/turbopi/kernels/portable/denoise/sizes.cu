@@ -44,8 +44,6 @@ constexpr int WEIGHT_BYTES = SCALED ? 1 : 2, OPERAND_BYTES = FP8 ? 1 : 2;  // an
 constexpr int CHUNK = 64 / WEIGHT_BYTES;                 // columns
 constexpr int PIECES = OPERAND_BYTES / WEIGHT_BYTES;     // of 64 bytes: a token's activations in a chunk
 constexpr int CHUNK_BYTES = 512;           // of a tile
-constexpr int GROUPS = (T + 7) / 8;        // of 8 tokens
-constexpr int M_TILES = (T + 15) / 16;
 constexpr int ROWS = T * GROUP;  // of the queries of a key/value head, row = token * GROUP + head in the group
 constexpr int HEAD_ROW_TILES = (ROWS + 15) / 16, ROW_TILES = KV_HEADS * HEAD_ROW_TILES;
 constexpr int SPLITS = TP_SPLITS;  // shares of the keys
@@ -63,12 +61,22 @@ constexpr __host__ __device__ int divisor(int of, int limit) {  // the largest o
   return found;
 }
 
-// A product's shape and how warps share it out.
-template <int CHANNELS_, int COLUMNS_>
+constexpr __host__ __device__ int power_of_two(int up_to, int limit) {  // the largest one
+  int found = 1;
+  while (found * 2 <= up_to && found * 2 <= limit) found *= 2;
+  return found;
+}
+
+// A product's shape and how warps share it out. RANGES_: tokens are cut into so many; a block has tiles for one of them.
+template <int CHANNELS_, int COLUMNS_, int RANGES_ = 1>
 struct Shape {
   static constexpr int TILES = CHANNELS_ / 8;
   static constexpr int CHUNKS = (COLUMNS_ + CHUNK - 1) / CHUNK;
-  static constexpr int BLOCK_TILES = (TILES + BLOCKS - 1) / BLOCKS;  // of a block at most
+  static constexpr int RANGES = RANGES_, RANGE = (T + RANGES - 1) / RANGES;        // tokens
+  static constexpr int GROUPS = (RANGE + 7) / 8, M_TILES = (RANGE + 15) / 16;      // of 8 and of 16 of them
+  static constexpr int PARTIES = BLOCKS / RANGES;                                  // of blocks with the same tiles
+  static constexpr bool LEFT_OUT = BLOCKS % RANGES > 0;                            // a block that has none
+  static constexpr int BLOCK_TILES = (TILES + PARTIES - 1) / PARTIES;              // of a block at most
   static constexpr int TILE_ROOM = TP_SUMS / M_TILES;                // of a warp, by its registers for sums
   static constexpr int WN_WANTED = (BLOCK_TILES + TILE_ROOM - 1) / TILE_ROOM;
   static constexpr int WN = WN_WANTED <= 1 ? 1 : WN_WANTED <= 2 ? 2 : 4;
@@ -82,14 +90,15 @@ struct Shape {
   static constexpr int IN_FLIGHT = divisor(LOADS, TP_WEIGHTS_IN_FLIGHT);
   static constexpr int A_ROOM = TP_ACTIVATIONS_IN_FLIGHT / (GROUPS * PIECES), A_WANTED = A_ROOM < 1 ? 1 : A_ROOM;
   static constexpr int A_IN_FLIGHT = A_WANTED < WARP_CHUNKS ? A_WANTED : WARP_CHUNKS;  // chunks
-  static constexpr int SUM_WORDS = WK * PASS_TILES * GROUPS * 8 * 8;
+  static constexpr int SUM_ROWS = RANGES > 1 ? RANGE : GROUPS * 8, SUM_WORDS = WK * PASS_TILES * SUM_ROWS * 8;
   static constexpr long long BYTES = (long long)TILES * CHUNKS * CHUNK_BYTES;
 };
-using QkvShape = Shape<QKV_ROWS, D>;
-using OutShape = Shape<D, HEADS * HD>;
-using GateUpShape = Shape<2 * F, D>;
-using DownShape = Shape<D, F>;
-using MixShape = Shape<D, D>;
+using QkvShape = Shape<QKV_ROWS, D, TP_RANGES>;
+using OutShape = Shape<D, HEADS * HD, TP_RANGES>;
+using GateUpShape = Shape<2 * F, D, TP_RANGES>;
+using DownShape = Shape<D, F, TP_RANGES>;
+using MixShape = Shape<D, D, TP_RANGES>;
+using EmbedShape = Shape<D, F>;  // how a step's first phase shares out columns
 constexpr long long QKV_AT = 0, OUT_AT = QkvShape::BYTES, GATE_UP_AT = OUT_AT + OutShape::BYTES;
 constexpr long long DOWN_AT = GATE_UP_AT + GateUpShape::BYTES, LAYER_BYTES = DOWN_AT + DownShape::BYTES;
 constexpr int D_TILES = D / 8;
@@ -97,10 +106,7 @@ constexpr int D_TILES = D / 8;
 // Shared memory, words. Sums of products and what attention keeps take turns.
 constexpr int DIM_GROUPS = (HD + 63) / 64;        // of 64 columns: what a warp weighs of values
 constexpr int KEY_GROUPS = WARPS / DIM_GROUPS < 8 ? WARPS / DIM_GROUPS : 8;  // of warps, which share out the keys
-// What a warp has on its way of keys and values before the barrier: its first, or of heads of few columns all of them.
-constexpr bool ALL_AHEAD = HD <= 64;
-constexpr int KEYS_AHEAD = ALL_AHEAD ? (SPLIT_KEYS / 8 + WARPS - 1) / WARPS : 1;
-constexpr int VALUES_AHEAD = ALL_AHEAD ? (SPLIT_KEYS / 16 + KEY_GROUPS - 1) / KEY_GROUPS : 1;
+constexpr bool BY_WARPS = HD <= 64 && SPLITS == 1;  // attention of narrow heads: attention_by_warps.cu
 constexpr int LOGITS_ROW = SPLIT_KEYS + 4, WEIGHTS_ROW = SPLIT_KEYS / 2 + 4, OUT_ROW = HD + 4;
 constexpr int S_RMS = 0, S_WORK = 64;
 constexpr int S_WEIGHTS = S_WORK + 16 * LOGITS_ROW, S_OUT = S_WEIGHTS + 16 * WEIGHTS_ROW;
