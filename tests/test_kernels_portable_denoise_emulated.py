@@ -145,7 +145,7 @@ def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.Monkey
 
 def test_blocks_that_wait_in_vain_give_up_and_say_where(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     p = problem("golden", 1, 1, 5, 1, CPU)
-    monkeypatch.setattr(denoise, "LOOKS", 400)
+    monkeypatch.setattr(denoise, "LOOKS", 75)
     kernel = made(p, PackedExpert.pack(p.config, p.layers), monkeypatch, folder, blocks=2)
     launch = p.noise, p.cache_k, p.cache_v, torch.tensor([p.length])
     steps = torch.zeros(2, *p.noise.shape), torch.zeros(1, *p.noise.shape)

@@ -123,9 +123,7 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     "vision's attention in batches": partial(
         _attention, attention.AttentionTile(72, 64, 4, wide=True, queries=2), False
     ),
-    "SmolVLA's vision attention": partial(
-        _attention, attention.AttentionTile(64, 128, 3, wide=True, queries=2), False
-    ),
+    "SmolVLA's vision attention": partial(_attention, attention.AttentionTile(64, 128, 3, wide=True, queries=2), False),
     "prefixes' attention": partial(_attention, attention.AttentionTile(256, 80, wide=True), False, packed=True),
     "suffixes' attention, fp8": partial(_suffixes, SuffixTile(256, 80, 4, 80), True),
     "suffixes' attention in few clusters, fp8": partial(_suffixes, FewTile(256, 40, 6, 96, 2), True),

@@ -175,7 +175,7 @@ def _loop(
         cache_rows=cache_rows,
         suffix=suffix,
         weights=weights,
-        choice=denoise.choices(suffix, form),
+        choice=denoise.choices(suffix, form, MULTIPROCESSORS[target.capability]),
         form=form,
     )
     assert target.shared >= denoise.SHARED_BYTES, target

@@ -62,12 +62,14 @@ FEW = Choices(warps=16, sums=8, weights=8, activations=8, ahead=True)  # up to 1
 MANY = Choices(warps=8, sums=16, weights=8, activations=14, ahead=True)
 
 
-NARROW = Choices(warps=16, sums=8, weights=12, activations=8, ahead=True, ranges=2)  # of SmolVLA's width
+NARROW = Choices(warps=16, sums=8, weights=8, activations=7, ahead=True)  # of SmolVLA's width
+# The same on a GPU of as many multiprocessors as an H200: on fewer a block has so many tiles that addresses are spilled
+IN_RANGES, MANY_BLOCKS = Choices(warps=16, sums=8, weights=12, activations=8, ahead=True, ranges=2), 132
 
 
-def choices(suffix: int, form: Form = PI05) -> Choices:
+def choices(suffix: int, form: Form = PI05, blocks: int = 0) -> Choices:
     if not form.modulated:
-        return NARROW if suffix > 16 else replace(NARROW, ranges=1)
+        return IN_RANGES if suffix > 16 and blocks >= MANY_BLOCKS else NARROW
     return FEW if suffix <= 16 else MANY
 
 
@@ -226,7 +228,8 @@ class PortableDenoiser(CooperativeDenoiser):
             raise BackendUnavailable("the portable denoising kernel has no times by token")
         reason = unavailable(device, packed.numbers)
         check_covered("the portable denoising kernel", reason, suffix, MAX_SUFFIX)
-        choice, blocks = choice or choices(suffix, packed.form), blocks or multiprocessors(device)
+        blocks = blocks or multiprocessors(device)
+        choice = choice or choices(suffix, packed.form, blocks)
         if not has_large_l2(device):
             choice = replace(choice, ahead=False)
         assert (mixing is None) == packed.form.modulated, "one or the other brings in the time"

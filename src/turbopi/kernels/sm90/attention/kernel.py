@@ -37,8 +37,8 @@ PARAMETERS = Parameters(
 
 ENOUGH_UNITS = 0.7  # wide ones, by multiprocessor: then they are sooner (docs/dev/log.md, "Attention of batches")
 MOST_OF_FOUR = 72  # columns for which four wide warpgroups have registers
-# Three wide warpgroups: the most columns; the part of the rows that four give the busiest multiprocessor, at most; what a
-# unit takes there that is filled in part.
+# Three wide warpgroups: the most columns; the part of the rows that four give the busiest multiprocessor, at most; what
+# a unit takes there that is filled in part.
 MOST_OF_THREE, GAIN_OF_THREE, PARTIAL = 64, 0.85, 0.6
 
 
