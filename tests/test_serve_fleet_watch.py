@@ -108,34 +108,13 @@ def test_why_no_replica_runs_is_known_and_forgotten(ray: socket.socket) -> None:
 
 
 class Held(RemoteCalls):
-    """Where requests are computed: replicas that hold each request for ever."""
+    """Where requests are computed: they wait for a replica, and there is none."""
 
     def __init__(self, metrics: Metrics, on_lost: Callable[[str], None], watch: Watch) -> None:
-        super().__init__(Handle(), metrics, MOST_SECONDS, watch, on_lost)
+        super().__init__("arms", metrics, MOST_SECONDS, watch=watch, on_lost=on_lost)
 
 
-class Handle:
-    """Ray Serve's, as far as it is used."""
-
-    def __init__(self) -> None:
-        self.infer = self
-
-    def remote(self, *arguments: Any) -> Any:
-        return Response()
-
-
-class Response:
-    def __await__(self) -> Any:
-        return asyncio.Event().wait().__await__()
-
-    def cancel(self) -> None:
-        pass
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default")  # Ray's own
 def test_requests_that_wait_are_answered_when_ray_ends_and_health_says_so(ray: socket.socket) -> None:
-    pytest.importorskip("ray")
     watch, address = Watch(at(ray), lambda: False, lambda: None), at(ray)
     with (
         running(FakePolicy(), calls=lambda metrics, on_lost: Held(metrics, on_lost, watch)) as serving,
@@ -168,7 +147,7 @@ class Resting(RemoteCalls):
     why: str | None = None
 
     def __init__(self, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
-        super().__init__(None, metrics, MOST_SECONDS)
+        super().__init__("arms", metrics, MOST_SECONDS)
 
     @property
     def unwell(self) -> str | None:

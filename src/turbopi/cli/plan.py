@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MOST_ROBOTS = 10_000
 RUN = "run"  # begins the line with the command
-DECODED = 500  # observations a second, by one server (docs/fleet.md)
+DECODED = 1200  # observations a second, by one server (docs/fleet.md)
 
 
 @command(
@@ -126,7 +126,6 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
     from turbopi.bench.batch_table import how_to_measure
     from turbopi.quantization.plan import TIERS
-    from turbopi.serve.fleet.fleet import MOST_AT_ONCE
     from turbopi.serve.options import ServerOptions
 
     each = ", ".join(f"T({size}) {seconds * 1e3:.1f}" for size, seconds in table.seconds.items())
@@ -162,8 +161,6 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         reported.append("Robots carry out whole chunks, and stand still for the delay")
     if (alone := fleet.delay(planned.worst_seconds, 1)) < planned.delay_steps:
         reported.append(f"Without Ray, a server on each GPU: {alone} control steps at most")
-    if planned.robots_per_gpu > MOST_AT_ONCE and planned.gpus > 1:
-        reported.append(f"A replica takes {MOST_AT_ONCE} requests at once, so the delay may be longer: take more GPUs")
     if (servers := math.ceil(a_second / DECODED)) > 1:
         reported.append(f"One server decodes some {DECODED} observations a second: take {servers} servers")
     if fleet.robots > 1 and len(table.seconds) == 1:

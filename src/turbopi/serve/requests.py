@@ -240,13 +240,19 @@ class RequestHandler:
         decoded = loop.run_in_executor(self._decoder, decode, message, self._max_bytes, Unpacker())
         await asyncio.wait((decoded,))
         connection.took(time.perf_counter() - started)
-        return self._begin(connection, decoded.result, arrived)
+        return self._begin(connection, message, decoded.result, arrived)
 
     def begin(self, connection: GuardedConnection, message: str | bytes | memoryview, arrived: float) -> "Begun":
         """Submit the request that a message holds, without waiting. For its results call `finish`, or `drop`."""
-        return self._begin(connection, partial(self._decode, connection, message), arrived)
+        return self._begin(connection, message, partial(self._decode, connection, message), arrived)
 
-    def _begin(self, connection: GuardedConnection, received: Callable[[], dict[str, Any]], arrived: float) -> "Begun":
+    def _begin(
+        self,
+        connection: GuardedConnection,
+        message: str | bytes | memoryview,
+        received: Callable[[], dict[str, Any]],
+        arrived: float,
+    ) -> "Begun":
         if (lost := self._why_lost()) is not None:
             return Refusal("lost", REFUSALS["lost"].format(lost))
         try:
@@ -256,7 +262,8 @@ class RequestHandler:
         except ObservationError as error:
             return Refusal("observation", REFUSALS["observation"].format(error))
         request.submitted = time.perf_counter()
-        request.results = self._submit(request)
+        assert not isinstance(message, str)  # else it was refused
+        request.results = self._submit(request, message)
         return request
 
     async def finish(self, request: ClientRequest) -> Reply | Refusal:
@@ -334,10 +341,11 @@ class RequestHandler:
         request.results.cancel()
         self._release(request.plan)
 
-    def _submit(self, request: ClientRequest) -> "asyncio.Future[list[Result]]":
+    def _submit(self, request: ClientRequest, message: bytes | memoryview) -> "asyncio.Future[list[Result]]":
         plan, batch = request.plan, request.scheduling.batch
         if batch is None:
             scheduled = request.scheduled()
+            scheduled.message = message
             if plan.session is None and plan.name is None and self._histories is None:
                 scheduled.answer = partial(self._answer_at_once, request)
             return self._calls.submit(scheduled, plan.observation, plan.arguments)

@@ -1,12 +1,13 @@
 """A fleet: replicas of one policy on many GPUs and machines, run by Ray Serve, behind one policy server.
 
-    robot ── openpi's websocket ──▶ PolicyServer ── Fleet ── Ray Serve ──▶ Replica on a GPU
-    robot ──────────────────────▶      │                        └───────▶ Replica on another GPU
+    robot ── openpi's websocket ──▶ PolicyServer ── RemoteCalls ── channel ──▶ Replica on a GPU
+    robot ──────────────────────▶      │                └───────── channel ──▶ Replica on another GPU
 
 The server in front is the one of `turbopi serve`, with its whole protocol, limits and metrics; only its requests are
-computed elsewhere (remote_calls.py). It stores the running chunks of real-time sessions. So a session belongs to the
-server, not to a replica: any replica may answer any request (ray_router.py chooses), and one that dies takes no session
-along. Which processes there are and where, whether they are well, and how they are replaced: that is Ray Serve's part.
+computed elsewhere: a robot's message goes on as it came (channel.py). It stores the running chunks of real-time
+sessions. So a session belongs to the server, not to a replica: any replica may answer any request (remote_calls.py
+chooses), and one that dies takes no session along. Which processes there are and where, whether they are well, and how
+they are replaced: that is Ray Serve's part.
 
 A request whose replica died is not tried again on another one: if it was the observation that killed it, one robot
 would kill them all. The client gets an error, and may send it again.
@@ -14,7 +15,6 @@ would kill them all. The client gets an error, and may send it again.
 Ray is imported when a fleet is started. docs/fleet.md is for users.
 """
 
-import asyncio
 import logging
 import os
 import time
@@ -27,8 +27,8 @@ from typing import Any
 from packaging.specifiers import SpecifierSet
 
 from turbopi.serve.calls import Policy
-from turbopi.serve.fleet.remote_calls import ROUTER_LINE, RemoteCalls
-from turbopi.serve.fleet.replica import Line, Replica
+from turbopi.serve.fleet.remote_calls import RemoteCalls
+from turbopi.serve.fleet.replica import Replica
 from turbopi.serve.fleet.watch import Watch, answers
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
@@ -38,12 +38,12 @@ from turbopi.support.installation import install_command
 logger = logging.getLogger(__name__)
 
 RAY = SpecifierSet(">=2.60,<3")
-ROUTER = "turbopi.serve.fleet.ray_router.FewestRequests"
+ROUTER = "turbopi.serve.fleet.ray_router.Places"
+SCALING = "turbopi.serve.fleet.ray_router.by_requests"
 DEPLOYMENT = "policy"  # the replicas' name inside of their application
 HEALTH_PERIOD = 2.0  # seconds between Ray Serve's health checks of a replica
 DRAIN_SECONDS = 30.0  # that a replica which is replaced may take for the requests that it has
 START_TRIES = 3
-MOST_AT_ONCE = 64  # requests of a replica: the line before its policy refuses earlier
 POLL_SECONDS = 0.5
 REACH_SECONDS = 3.0  # for an answer of a replica that may have ended
 STARTED_HERE = {  # of a Ray that is started here
@@ -53,7 +53,7 @@ STARTED_HERE = {  # of a Ray that is started here
 TOKEN_LOGGER = "ray._private.authentication.authentication_token_setup"
 TOKEN_LINES = "Token authentication is enabled"  # what begins the three lines that it says at every start
 QUIET = {"log_level": "WARNING", "enable_access_log": False}  # a line for each request would cost more than it tells
-OBJECT_STORE_BYTES = 256 * 2**20  # of a Ray that is started here: observations don't go through it
+OBJECT_STORE_BYTES = 256 * 2**20  # of a Ray that is started here: robots' observations don't go through it
 
 
 @dataclass(frozen=True)
@@ -274,14 +274,12 @@ def replicas(
     count, use_gpus = planned(options)
     scale: dict[str, Any] = {"num_replicas": count}
     if options.autoscaling is not None:
-        scale = {"autoscaling_config": dict(options.autoscaling)}
+        scale = {"autoscaling_config": {"policy": {"policy_function": SCALING}, **options.autoscaling}}
         check_known(options.autoscaling)
     try:
         deployment = serve.deployment(
             name=DEPLOYMENT,
             ray_actor_options={"num_gpus": int(use_gpus), "num_cpus": options.cpus},
-            max_ongoing_requests=MOST_AT_ONCE,
-            max_queued_requests=ROUTER_LINE,
             health_check_period_s=HEALTH_PERIOD,
             graceful_shutdown_timeout_s=DRAIN_SECONDS,
             graceful_shutdown_wait_loop_s=POLL_SECONDS,
@@ -343,10 +341,7 @@ class Fleet:
     """The replicas as a policy for PolicyServer: `PolicyServer(fleet, calls=fleet.calls)`. `attach` makes one."""
 
     def __init__(self, handle: Any, name: str, about: Mapping[str, Any], answer_seconds: float) -> None:
-        # Without references a request goes directly to the replica's gRPC port. By Ray's object store, the default,
-        # a call with two images took twice as long: 7.1 instead of 3.4 ms on two CPU cores.
-        self._handle = handle.options(_by_reference=False)
-        self._answer_seconds = answer_seconds
+        self._handle, self._answer_seconds = handle, answer_seconds
         self.metadata: dict[str, Any] = {**about, "fleet": name}
 
     @classmethod
@@ -362,33 +357,32 @@ class Fleet:
         options: dict[str, Any] = _call_replica(name, self._handle.started_with, self._answer_seconds)
         return options
 
-    def calls(self, metrics: Metrics, on_lost: Callable[[str], None] = lambda reason: None) -> "RemoteCalls":
-        watch = Watch(address(), self._answers, partial(why_unwell, self.metadata["fleet"]))
-        return RemoteCalls(self._handle, metrics, self._answer_seconds, watch, on_lost)
-
-    def _answers(self) -> bool:
-        """Whether a replica can be reached."""
-        try:
-            self._handle.about.remote().result(timeout_s=REACH_SECONDS)
-        except Exception:  # Ray's or gRPC's: no answer
-            return False
-        return True
+    def calls(self, metrics: Metrics, on_lost: Callable[[str], None] = lambda reason: None) -> RemoteCalls:
+        name, want = (
+            str(self.metadata["fleet"]),
+            self._handle.about.remote,
+        )  # Ray Serve, scaled to none, starts one then
+        watch = Watch(address(), lambda: calls.reaches_any, partial(why_unwell, name))
+        calls = RemoteCalls(name, metrics, self._answer_seconds, want, watch, on_lost)
+        return calls
 
     def infer(self, obs: dict[str, Any], /, **arguments: Any) -> dict[str, Any]:
-        """One request, at the replica that has the fewest. Raises BackendError if it gives no actions."""
-        result = asyncio.run(self.calls(Metrics()).run(obs, arguments, Line()))
+        """One request, by Ray Serve's own way. Raises BackendError if it gives no actions."""
+        name = str(self.metadata["fleet"])
+        result = _call_replica(name, self._handle.infer, self._answer_seconds, obs, arguments).result
         if result.answer is None:
-            raise BackendError(f"the fleet {self.metadata['fleet']!r} gave no actions: {result.text}")
-        return result.answer
+            raise BackendError(f"the fleet {name!r} gave no actions: {result.text}")
+        answer: dict[str, Any] = result.answer
+        return answer
 
 
-def _call_replica(name: str, method: Any, seconds: float) -> Any:
-    """What a replica answers to a method without arguments."""
+def _call_replica(name: str, method: Any, seconds: float, *arguments: Any) -> Any:
+    """What a replica answers to a call."""
     from ray.exceptions import RayError
     from ray.serve.exceptions import RayServeException
 
     try:
-        return method.remote().result(timeout_s=seconds)
+        return method.remote(*arguments).result(timeout_s=seconds)
     except (TimeoutError, RayError, RayServeException) as error:
         why = f" within {seconds:g} s" if isinstance(error, TimeoutError) else f": {reason_in(str(error))}"
         raise BackendError(f"no replica of the fleet {name!r} answers{why}") from error

@@ -22,7 +22,7 @@ from turbopi.serve.scheduling.batch_times import BatchTimes
 from turbopi.support.errors import ConfigError
 
 OVERHEAD_MS = 2.0  # of a request, usually: the network, the server
-RAY_MS = 6.0  # more behind Ray, at most (docs/fleet.md)
+RAY_MS = 2.0  # more in a fleet, at most (docs/fleet.md)
 ROUNDING = 1e-9  # of a control step: 3.0000000001 steps are 3
 
 
@@ -35,7 +35,7 @@ class Fleet:
     execution_horizon  s, control steps from one request to the next; None: half of H. H: they stand still for d
     delay_steps        the most control steps of delay; None: as many as s and H allow
     overhead_ms        of a request beyond the policy's part: the network, the server
-    ray_ms             more of it with several GPUs, behind Ray
+    ray_ms             more of it with several GPUs, in a fleet
     """
 
     robots: int

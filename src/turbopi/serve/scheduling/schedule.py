@@ -64,6 +64,7 @@ class Request:
     later     observations of the same message in later requests: the deadline is for the last of them
     alone     never in a batch with others
     joins     it joins a chunk or requests model_actions: runs with such a request have a table T(B) of their own
+    message   the client's, if all of it is this observation; not read here
     call      what to run; not read here
     answer    sends its result at once, from any thread; not read here
     """
@@ -80,6 +81,7 @@ class Request:
     joins: bool = False
     continued: bool = False  # of a message that has its place in the line already
     slowed: bool = False  # its source is read more slowly than it sends: its pauses say nothing, and it has no claim
+    message: bytes | memoryview | None = None
     call: Any = None
     answer: Callable[[Any], object] | None = None
     number: int = field(default=0, init=False)  # in the order in which they came
