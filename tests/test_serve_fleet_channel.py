@@ -110,7 +110,7 @@ def robot(server: PolicyServer) -> Iterator[Callable[[Any], Any]]:
         yield ask
 
 
-class Told(FakePolicy):
+class Reported(FakePolicy):
     """Keeps the arguments of its calls."""
 
     def __init__(self) -> None:
@@ -144,19 +144,19 @@ def test_a_message_reaches_the_replica_as_it_came(fleet: Fleet, monkeypatch: pyt
 
 
 def test_what_a_request_says_besides_reaches_the_policy_too(fleet: Fleet) -> None:
-    policy = Told()
+    policy = Reported()
     fleet.start("left", policy)
     calls: Any = lambda metrics, on_lost: RemoteCalls(fleet.name, metrics, MOST_SECONDS)  # noqa: E731
-    with running(Told(), calls=calls) as server, robot(server) as ask:
+    with running(Reported(), calls=calls) as server, robot(server) as ask:
         left_over = np.full((2, 8), 0.5, np.float32)
         keys = {"previous": left_over, "delay": 1, "mode": "rtc", "seed": 7, "model_actions": True}
         answer = ask({**observation(), **{f"turbopi/{key}": value for key, value in keys.items()}})
         assert answer["real_time"]["joined"] and answer["model_actions"].shape == (2, 8)
-        (told,) = policy.arguments
-        previous = told["previous"]
+        (reported,) = policy.arguments
+        previous = reported["previous"]
         assert isinstance(previous, RunningChunk) and (previous.delay, previous.mode) == (1, "rtc")
         np.testing.assert_array_equal(previous.left_over, left_over)
-        assert told["seed"] == 7 and told["model_actions"] is True
+        assert reported["seed"] == 7 and reported["model_actions"] is True
         assert policy.observations[""].keys() == OBSERVATION.keys()
 
 
