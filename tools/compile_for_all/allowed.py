@@ -20,8 +20,8 @@ ALLOWED: dict[str, dict[int, int]] = {
     # Into INT8, tiles that only a measurement chooses
     "attention.prefix": {90: 16},
     "batch.packed": {90: 8},
-    # As `denoise.kernel`, in the 128 registers that 16 warps leave. Timed on an H200 with 40 of them at 9.0. A warp holds
-    # 16 keys of attention and their values: 8 to 16 bytes more at 8.0, 8.9 and 11.0, less elsewhere
+    # As `denoise.kernel`, in the 128 registers that 16 warps leave. Timed on an H200 with 40 of them at 9.0. In
+    # attention a warp holds 16 keys and their values: 8 to 16 bytes more at 8.0, 8.9 and 11.0, less elsewhere
     "SmolVLA's denoise.kernel": {
         80: 56,
         86: 40,
