@@ -7,12 +7,13 @@ from typing import Any
 
 from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
+from packed import read_packed_benchmark
 
 from doc_tables.fleet import sizing
 from doc_tables.gpus import gpu_predictions, gpu_refusals, gpu_reports, gpus
 from doc_tables.peers import peers, read_run
 from doc_tables.studies import few_steps, read_report, study
-from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
+from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps
 from turbopi.bench.work import JOINS
 from turbopi.support.provenance import Gpu
 from turbopi.support.text import significant
@@ -308,7 +309,7 @@ _OF_BENCHMARKS = (
     *(errors, ready, kernels, machine),
 )
 TABLES = {
-    **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
+    **{lines.__name__: Table(read_packed_benchmark, lines) for lines in _OF_BENCHMARKS},
     "delays": Table(_read_delays, delays),
     "small_policy": Table(_read_judged, small_policy),
     "small_policy_delays": Table(_read_judged, small_policy_delays),
