@@ -29,7 +29,7 @@ from turbopi.serve.scheduling.schedule import Schedule
 from turbopi.support.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
-CERTIFICATE = ROOT / "benchmarks" / "results" / "h100_2026-11-26_int8" / "verify.json"
+NO_BENCHMARK = ROOT / "benchmarks" / "results" / "h200_2026-11-26_small_policy" / "judged.json"
 SETTINGS = settings(max_examples=60, deadline=None)  # how long an example takes says nothing
 RESULT = ROOT / "benchmarks/results/h200_2026-11-26_pi05_libero/results.json"
 
@@ -420,7 +420,7 @@ def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(re
         ([], "give --gpu GPU, or --times FILE"),
         (["--gpu", "h200", "--times", "x"], "--gpu h200 and --times x each name"),
         (["--times", "no/such/file.json"], "no/such/file.json"),
-        (["--times", str(CERTIFICATE)], "verify.json holds no benchmark; expected the results.json of `turbopi bench"),
+        (["--times", str(NO_BENCHMARK)], "judged.json holds no benchmark; expected the results.json of `turbopi bench"),
         (["--gpu", "orin"], "this GPU can't do it for a single robot"),
     ],
 )
