@@ -313,15 +313,20 @@ def test_a_policy_that_hangs_costs_its_robots_their_time_and_no_more(fleet: Flee
         wait_for(lambda: isinstance(ask(observation("again")), dict))
 
 
+def wait_behind_one(ask: Any, other: Any, policy: FakePolicy, replica: Replica) -> None:
+    """`ask` has a request at the policy, which holds it, and `other` one in the line behind it."""
+    ask.send(observation("hold"))
+    wait_for(policy.started.is_set)
+    other.send(observation("waits"))
+    wait_for(lambda: replica.record_autoscaling_stats() == {"requests": 2})
+
+
 def test_the_request_of_a_client_that_left_never_runs(fleet: Fleet) -> None:
     policy = FakePolicy()
     replica = fleet.start("left", policy)
     with fleet.server() as server, robot(server) as ask:
-        ask.send(observation("hold"))  # type: ignore[attr-defined]
-        wait_for(policy.started.is_set)
         with robot(server) as leaves:
-            leaves.send(observation("left"))  # type: ignore[attr-defined]
-            wait_for(lambda: replica.record_autoscaling_stats() == {"requests": 2})
+            wait_behind_one(ask, leaves, policy, replica)
         wait_for(lambda: replica.record_autoscaling_stats() == {"requests": 1})
         policy.release.set()
         ask.received()  # type: ignore[attr-defined]
@@ -332,17 +337,13 @@ def test_the_request_of_a_client_that_left_never_runs(fleet: Fleet) -> None:
 def test_a_server_that_ended_leaves_nothing_at_its_replicas(fleet: Fleet) -> None:
     policy = FakePolicy()
     replica = fleet.start("left", policy)
-    with fleet.server() as server, robot(server) as ask:
-        ask.send(observation("hold"))  # type: ignore[attr-defined]
-        wait_for(policy.started.is_set)
-        with robot(server) as waits:
-            waits.send(observation("waits"))  # type: ignore[attr-defined]
-            wait_for(lambda: replica.record_autoscaling_stats() == {"requests": 2})
-            (front,) = replica._requests
-            fleet.loop.call_soon_threadsafe(front.transport.abort)
-            wait_for(lambda: front not in replica._requests)
-            policy.release.set()
-            assert waits.received().startswith("the replica is lost: ")  # type: ignore[attr-defined]
+    with fleet.server() as server, robot(server) as ask, robot(server) as waits:
+        wait_behind_one(ask, waits, policy, replica)
+        (front,) = replica._requests
+        fleet.loop.call_soon_threadsafe(front.transport.abort)
+        wait_for(lambda: front not in replica._requests)
+        policy.release.set()
+        assert waits.received().startswith("the replica is lost: ")  # type: ignore[attr-defined]
     assert policy.seen == ["hold"]
 
 

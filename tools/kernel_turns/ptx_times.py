@@ -41,14 +41,9 @@ class TimedTile(Struct, frozen=True):
 
 
 class TimedAsPtx(Struct, frozen=True):
-    """An operation of one observation's call, which runs it `uses` times."""
+    """An operation of one observation's call."""
 
-    operation: str
-    numbers: Numbers
-    rows: int
-    columns: int
-    inner: int
-    uses: int
+    operation: Operation
     flops: float  # of one; attention's of both products
     usual: TimedTile  # as the cost model chooses it
     best: TimedTile
@@ -57,7 +52,7 @@ class TimedAsPtx(Struct, frozen=True):
 
 
 class PtxTimes(Struct, frozen=True):
-    """What `python -m kernel_turns.ptx_times --out` writes. The operations named `LARGE` are the ceiling."""
+    """What `python -m kernel_turns.ptx_times --out` writes. The operations named "large" are the ceiling."""
 
     provenance: Provenance
     target: str
@@ -111,15 +106,10 @@ def timed(one: Operation, target: Target) -> TimedAsPtx:
         raise ConfigError(f"{one.name}, {one.numbers}: the usual tile is wrong or doesn't compile: {refused.get(0)}")
     each = [TimedTile(knobs, _alone(bench, knobs)) for knobs in right]
     norms = None
-    if one.norm_in_front or one.norm_behind:
-        norms = _median(bench.timer(candidates[0])) - each[0].microseconds if one.numbers == "fp8" else None
+    if one.numbers == "fp8" and (one.norm_in_front or one.norm_behind):
+        norms = _median(bench.timer(candidates[0])) - each[0].microseconds
     return TimedAsPtx(
-        operation=one.name,
-        numbers=one.numbers,
-        rows=one.rows,
-        columns=one.columns,
-        inner=one.inner,
-        uses=one.uses,
+        operation=one,
         flops=flops_of(one),
         usual=each[0],
         best=min(each, key=lambda tile: tile.microseconds),
@@ -130,11 +120,12 @@ def timed(one: Operation, target: Target) -> TimedAsPtx:
 
 def times(target: Target) -> Iterator[TimedAsPtx]:
     found = [one for one in found_operations(target) if one.batch == 1 and one.images <= ONE.cameras]
-    numbers = tuple(dict.fromkeys(one.numbers for one in found))
+    numbers = dict.fromkeys(one.numbers for one in found)
+    # of bfloat16 attention alone: GeGLU's product is the library's
+    own = [one for one in found if one.numbers != "bf16" or not (one.out_fp8 or one.operation == "geglu")]
     with compiled_as(target), torch.no_grad():
-        for one in [*map(large, numbers), *found]:
-            if one.numbers != "bf16" or not (one.out_fp8 or one.operation == "geglu") or one.name == "large":
-                yield timed(one, target)
+        for one in (*map(large, numbers), *own):
+            yield timed(one, target)
 
 
 def main() -> None:
@@ -148,11 +139,9 @@ def main() -> None:
     arguments = parser.parse_args()
     target, rows = Target(divmod(arguments.target, 10)), []
     for row in times(target):
-        print(
-            f"{row.numbers} {row.operation}, {row.rows} x {row.columns} x {row.inner}: {row.usual.microseconds:.1f} us "
-            f"as usual, at best {row.best.microseconds:.1f}, {row.flops / row.best.microseconds / 1e6:.0f} TFLOP/s",
-            flush=True,
-        )
+        one, rate = row.operation, row.flops / row.best.microseconds / 1e6
+        took = f"{row.usual.microseconds:.1f} us as usual, at best {row.best.microseconds:.1f}, {rate:.0f} TFLOP/s"
+        print(f"{one.numbers} {one.name}, {one.size}: {took}", flush=True)
         rows.append(row)
         document = PtxTimes(provenance(GPU), f"compute_{target.number}", rows)
         arguments.out.write_text(json.dumps(plain_document(document), indent=1) + "\n")

@@ -35,7 +35,7 @@ class Place(NamedTuple):
     secret: str
 
 
-# Of each fleet's replicas, by Ray Serve's names, as its router in this process was told last (ray_router.py).
+# Of each fleet's replicas, by Ray Serve's names, as its router in this process has them (ray_router.py).
 PLACES: dict[str, dict[str, Place]] = {}
 
 

@@ -358,10 +358,8 @@ class Fleet:
         return options
 
     def calls(self, metrics: Metrics, on_lost: Callable[[str], None] = lambda reason: None) -> RemoteCalls:
-        name, want = (
-            str(self.metadata["fleet"]),
-            self._handle.about.remote,
-        )  # Ray Serve, scaled to none, starts one then
+        name = str(self.metadata["fleet"])
+        want = self._handle.about.remote  # Ray Serve, scaled to none, starts one then
         watch = Watch(address(), lambda: calls.reaches_any, partial(why_unwell, name))
         calls = RemoteCalls(name, metrics, self._answer_seconds, want, watch, on_lost)
         return calls

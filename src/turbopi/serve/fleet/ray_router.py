@@ -12,7 +12,7 @@ from turbopi.serve.fleet import channel
 
 
 class Places(RequestRouter):  # type: ignore[misc]  # Ray's types aren't checked
-    """A request router in Ray Serve's sense, for the sake of what it is told."""
+    """A request router in Ray Serve's sense, for the sake of what that reports to it."""
 
     def update_replicas(self, replicas: list[Any]) -> None:
         super().update_replicas(replicas)
