@@ -14,7 +14,7 @@ from typing import Any
 from prometheus_client import Histogram
 
 from turbopi.realtime.wire import pack
-from turbopi.serve.fleet.channel import PLACES, connect, messages, send
+from turbopi.serve.fleet.channel import PLACES, Place, connect, messages, send
 from turbopi.serve.fleet.replica import CLOSING, Answer, Line
 from turbopi.serve.fleet.session_affinity import SessionAffinity
 from turbopi.serve.fleet.watch import Watch
@@ -278,18 +278,24 @@ class RemoteCalls:
 
     async def _look(self) -> None:
         """Reach the replicas that Ray Serve knows, and leave those that it knows no more."""
-        places, unreached = PLACES.get(self._fleet, {}), None
+        places = PLACES.get(self._fleet, {})
         for name in self._replicas.keys() - places.keys():
             self._replicas[name].leave()
-        for name in places.keys() - self._replicas.keys():
-            try:
-                self._replicas[name] = one = _Replica(*await connect(places[name]))
-                one.reads.add_done_callback(partial(self._left, name))
-            except ConnectionError as error:
-                unreached = str(error)
+        new = places.keys() - self._replicas.keys()
+        failures = await asyncio.gather(*(self._reach(name, places[name]) for name in new))  # a machine may be gone
+        unreached = next(filter(None, failures), None)
         if unreached is not None and unreached != self._unreached:
             logger.warning("%s", unreached)
         self._unreached = unreached
+
+    async def _reach(self, name: str, place: Place) -> str | None:
+        """Why it can't be reached; None if it was."""
+        try:
+            self._replicas[name] = one = _Replica(*await connect(place))
+        except ConnectionError as error:
+            return str(error)
+        one.reads.add_done_callback(partial(self._left, name))
+        return None
 
     def _left(self, name: str, reads: object) -> None:
         del self._replicas[name]
