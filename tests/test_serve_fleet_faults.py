@@ -334,6 +334,14 @@ def test_a_fleet_grows_by_requests_that_ray_serve_does_not_see(fleet: FleetProce
     assert fleet.do("deploy", generation=5) == {}
 
 
+def test_a_fleet_of_no_replica_starts_one_for_a_request(fleet: FleetProcess) -> None:
+    none = {"min_replicas": 0, "max_replicas": 1, "upscale_delay_s": 0.5, "metrics_interval_s": 0.5}
+    assert fleet.do("deploy", generation=6, autoscaling=none) == {}
+    with fleet.robot() as robot:
+        assert wait_for(lambda: isinstance(answer := robot.ask(), dict) and answer["generation"] == 6)
+    assert fleet.do("deploy", generation=5) == {}
+
+
 def test_a_lost_device_ends_its_replica_alone(fleet: FleetProcess) -> None:
     with fleet.robot() as robot:
         before = processes(robot, generation=5)
