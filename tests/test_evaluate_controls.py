@@ -72,6 +72,14 @@ def test_the_policy_behind_a_control_is_warmed_up() -> None:
     assert source.requested == [(4, "rtc")]
 
 
+def test_the_pictures_of_one_task_alone_are_gray() -> None:
+    source = Recorder()
+    controlled = Controlled(source, "pictures", TASKS[:1] * 5, KEYS)
+    controlled.infer([observation(0, 1), observation(0, 2)], [0, 1])
+    assert {int(value) for given in source.requested for value in np.unique(given[KEYS[0]])} == {128}
+    assert "gray pictures" in controlled.label
+
+
 def test_an_unknown_prompt_passes_as_it_is() -> None:
     source = Recorder()
     example = observation(0, 5) | {"prompt": "something else"}
@@ -80,7 +88,7 @@ def test_an_unknown_prompt_passes_as_it_is() -> None:
     assert int(source.requested[0][KEYS[0]].max()) == 5
 
 
-@pytest.mark.parametrize(("control", "tasks"), [("prompt", TASKS[:1]), ("pictures", TASKS[:1] * 5), ("noise", TASKS)])
+@pytest.mark.parametrize(("control", "tasks"), [("prompt", TASKS[:1] * 5), ("noise", TASKS)])
 def test_a_control_that_is_impossible_is_refused(control: Any, tasks: list[str]) -> None:
     with pytest.raises(ConfigError, match="control"):
         Controlled(Recorder(), control, tasks, KEYS)

@@ -252,6 +252,23 @@ def test_visited_observations_give_the_action_error(tmp_path: Path) -> None:
     assert action_error([], source) is None
 
 
+def test_a_dimension_that_is_held_still_counts_in_its_own_unit() -> None:
+    class Still:
+        """Its fourth number is always 1, but for what un-normalising adds."""
+
+        def __init__(self, off: float) -> None:
+            self._off = off
+
+        def infer(self, observations: Any, seeds: Any) -> list[Answer]:
+            actions = np.random.default_rng(seeds[0]).normal(size=(10, 4))
+            actions[:, 3] = 1 + 1e-6 * actions[:, 3]
+            return [Answer(actions + self._off * np.array([0, 0, 0, 1]), None)]
+
+    entry = {"seed": np.array(3), "prompt": np.array("x"), "actions": Still(0).infer([{}], [3])[0].actions}
+    off = action_error([entry], Still(1e-4))  # type: ignore[arg-type]
+    assert off is not None and 0.9e-4 < off.max < 1.1e-4
+
+
 def visit(visited: Visited, number: int) -> None:
     observation = {"observation/image": np.full((8, 8, 3), number, np.uint8), "prompt": "x"}
     visited(None, 0, observation, number, Answer(np.zeros((2, 7)), None))  # type: ignore[arg-type]

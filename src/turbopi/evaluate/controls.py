@@ -27,10 +27,11 @@ class Controlled:
     """A policy source that hands wrong observations on to another one.
 
     prompt     the instruction of the task after this one (and the first's for the last)
-    images   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
+    pictures   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
                which episodes run side by side, so with several workers a run doesn't repeat exactly.
 
-    instructions   of the tasks that are evaluated, in order. Raises ConfigError if there are fewer than two.
+    instructions   of the tasks that are evaluated, in order. Of one alone the pictures are always gray; raises
+                   ConfigError for its prompt.
     """
 
     def __init__(
@@ -38,12 +39,16 @@ class Controlled:
     ) -> None:
         check_control(control)
         self._order = list(dict.fromkeys(instructions))
-        if len(self._order) < 2:
-            raise ConfigError(f"the control {control!r} takes another task's, but only one is evaluated; give more")
+        alone = len(self._order) < 2
+        if alone and control == "prompt":
+            raise ConfigError(
+                "the control 'prompt' takes another task's, but only one is evaluated: give more tasks, or the control "
+                "'pictures'"
+            )
         self._source, self._control, self._image_keys = source, control, tuple(image_keys)
         self._seen: dict[str, dict[str, np.ndarray]] = {}
         self.max_batch, self.real_time = source.max_batch, source.real_time
-        self.label = f"{source.label}, {control} of another task"
+        self.label = f"{source.label}, {'gray pictures' if alone else f'{control} of another task'}"
         self.identity = source.identity | {"control": control}
         self.about = source.about | {"control": control}
 

@@ -16,6 +16,7 @@ from turbopi.support.reading import listing, read_npz
 
 FILE = "visited.npz"
 KEPT = 48
+HELD = 1e-5  # spread of a dimension that a policy holds still, over its size or 1: un-normalising adds openpi's 1e-6
 
 
 class Visited:
@@ -75,7 +76,10 @@ class Recording:
 
 
 class ActionDifference(Struct, frozen=True):
-    """Difference to the reference's actions, each dimension in units of its own spread over the reference's chunks."""
+    """Difference to the reference's actions, each dimension in units of its own spread over the reference's chunks.
+
+    A dimension that the reference holds still (HELD) counts in its own unit: its spread is rounding.
+    """
 
     rms: float
     max: float
@@ -99,7 +103,7 @@ def action_error(entries: Sequence[Mapping[str, np.ndarray]], reference: PolicyS
         exact.append(reference.infer([observation], [int(entry["seed"])])[0].actions)
     truth, given = np.stack(exact), np.stack([entry["actions"] for entry in entries])
     spread = truth.std(axis=(0, 1))
-    spread[spread == 0] = 1
+    spread[spread <= HELD * np.maximum(1.0, np.abs(truth).max(axis=(0, 1)))] = 1
     error = (given - truth) / spread
     return ActionDifference(float(np.sqrt(np.mean(error**2))), float(np.abs(error).max()), len(entries))
 
