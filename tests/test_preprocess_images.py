@@ -137,7 +137,9 @@ def test_a_first_axis_of_three_counts_as_chw() -> None:
 BAD: list[tuple[Any, str]] = [
     (np.zeros((20, 30, 3), np.int64), "cam has dtype int64; send uint8"),
     (np.zeros((20, 30, 3), np.bool_), "cam has dtype bool"),
-    (np.array("image"), "cam has dtype <U5"),
+    (np.array("image"), "cam is text .*data:image/png;base64,.*; send uint8"),
+    (b"\xff\xd8\xff\xe0", "cam is bytes: decode a JPEG or PNG first; send uint8"),
+    (np.array(["a", None], object), "cam has dtype object; send uint8"),
     (np.zeros((20, 30), np.uint8), r"cam has shape \(20, 30\); send one image"),
     (np.zeros((1, 20, 30, 3), np.uint8), "without a batch axis"),
     (np.zeros((0, 30, 3), np.uint8), "cam is empty"),
@@ -147,7 +149,7 @@ BAD: list[tuple[Any, str]] = [
     (np.full((20, 30, 3), -0.1), "cam is a float image with values from -0.1"),
     (np.full((20, 30, 3), np.nan), "cam is a float image with values from nan"),
     ([[[1, 2, 3], [1, 2]]], "cam isn't an image"),
-    (None, "cam has dtype object"),
+    (None, "cam is None; send uint8"),
 ]
 
 

@@ -58,7 +58,7 @@ def check_image(value: object, name: str) -> np.ndarray:
     except Exception as error:
         raise ObservationError(f"{name} isn't an image: {error}") from error
     if image.dtype != _UINT8 and image.dtype.kind != "f":
-        raise ObservationError(f"{name} has dtype {image.dtype}; send uint8 in [0, 255] or float in [0, 1]")
+        raise ObservationError(f"{name} {_what(value, image)}; send uint8 in [0, 255] or float in [0, 1]")
     if image.ndim != 3:
         raise ObservationError(
             f"{name} has shape {image.shape}; send one image, (height, width, 3) or (3, height, width), "
@@ -67,6 +67,17 @@ def check_image(value: object, name: str) -> np.ndarray:
     if image.size == 0:
         raise ObservationError(f"{name} is empty: its shape is {image.shape}")
     return image
+
+
+def _what(value: object, image: np.ndarray) -> str:
+    """What came instead of an image, for a message."""
+    if value is None:
+        return "is None"
+    if image.dtype.kind == "S":
+        return "is bytes: decode a JPEG or PNG first"
+    if image.dtype.kind == "U":
+        return "is text (images in JSON begin with data:image/png;base64, or data:image/jpeg;base64,)"
+    return f"has dtype {image.dtype}"
 
 
 def check_hwc(value: object, name: str) -> np.ndarray:
