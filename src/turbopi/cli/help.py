@@ -27,8 +27,8 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            told = getattr(error.__cause__, "errors", None)  # pydantic's, whose message leaves the value out
-            if told is not None and "input" in (first := told()[0]):
+            problems = getattr(error.__cause__, "errors", None)  # pydantic's, whose message leaves the value out
+            if problems is not None and "input" in (first := problems()[0]):
                 error.message += f", not {str(first['input'])[:80]!r}"
             raise
 
