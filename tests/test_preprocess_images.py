@@ -160,9 +160,13 @@ def test_what_is_no_picture_is_refused(value: Any, message: str) -> None:
             parse(value, "cam")
 
 
-def test_chw_robots_refuse_hwc() -> None:
-    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 3\), but this robot's images are CHW"):
-        parse_chw_image(noise(20, 30, 3), "cam_high")
+def test_chw_robots_take_the_images_of_json_which_are_hwc() -> None:
+    image, ambiguous = noise(20, 30, 3), noise(3, 20, 3)
+    for either in (image, image.transpose(2, 0, 1)):
+        np.testing.assert_array_equal(parse_chw_image(either, "cam_high"), image)
+    np.testing.assert_array_equal(parse_chw_image(ambiguous, "cam_high"), ambiguous.transpose(1, 2, 0))
+    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 4\), but this robot's images are CHW, \(3, height, width\), or HWC"):
+        parse_chw_image(noise(20, 30, 4), "cam_high")
 
 
 # LeRobot's way

@@ -29,12 +29,13 @@ def parse_image(value: object, name: str) -> np.ndarray:
 
 
 def parse_chw_image(value: object, name: str) -> np.ndarray:
-    """One image that must be CHW, as openpi's ALOHA clients send it: uint8[h, w, 3]."""
+    """One image as openpi's ALOHA clients send it, CHW: uint8[h, w, 3]. HWC, as JSON has it, where only that is RGB."""
     image = check_image(value, name)
+    if image.shape[0] != 3 and image.shape[-1] == 3:
+        return to_uint8(image, name)
     if image.shape[0] != 3:
         raise ObservationError(
-            f"{name} has shape {image.shape}, but this robot's images are CHW: (3, height, width). "
-            f"Send numpy.transpose(image, (2, 0, 1)) of an HWC image"
+            f"{name} has shape {image.shape}, but this robot's images are CHW, (3, height, width), or HWC"
         )
     return to_uint8(image.transpose(1, 2, 0), name)
 
