@@ -4,6 +4,7 @@ import inspect
 import io
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -251,6 +252,18 @@ def test_options_are_called_as_the_command_has_them() -> None:
     assert as_typed(said, {"--precisions", "--backends"}) == shown
     ran = turbopi("bench", "--random-weights", "pi05_tiny", "--precisions", "fp8", "--device", "cpu")
     assert ran.exit_code == 2 and "take --precisions bf16" in ran.stderr
+
+
+def test_tables_fit_a_narrow_dumb_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((60, 20)))
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    assert Output().console.width == 60
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", "80x"), ("--port", "99999"), ("--max-batch", "-1")])

@@ -165,7 +165,7 @@ def test_chw_robots_take_the_images_of_json_which_are_hwc() -> None:
     for either in (image, image.transpose(2, 0, 1)):
         np.testing.assert_array_equal(parse_chw_image(either, "cam_high"), image)
     np.testing.assert_array_equal(parse_chw_image(ambiguous, "cam_high"), ambiguous.transpose(1, 2, 0))
-    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 4\), but this robot's images are CHW, \(3, height, width\), or HWC"):
+    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 4\), but this robot's images are CHW, "):
         parse_chw_image(noise(20, 30, 4), "cam_high")
 
 

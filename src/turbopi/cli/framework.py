@@ -13,6 +13,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -107,6 +108,8 @@ def new_console(*, stderr: bool) -> Console:
     console = Console(stderr=stderr)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = PLAIN_WIDTH
+    elif console.is_dumb_terminal:  # for which rich takes 80
+        console.size = shutil.get_terminal_size()
     return console
 
 
