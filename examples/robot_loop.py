@@ -82,7 +82,7 @@ def main() -> None:
                 control_hz=options.hz,
                 execution=options.execution,
                 hold_action=HOLD,
-                hold_on=("camera_black", "camera_frozen", "camera_exchanged", "camera_channels", "camera_turned"),
+                hold_on=[f"camera_{how}" for how in ("black", "frozen", "missing", "exchanged", "channels", "turned")],
                 max_observation_age_s=options.age,
             ) as executor,
             contextlib.suppress(KeyboardInterrupt),

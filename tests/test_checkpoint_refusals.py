@@ -23,6 +23,7 @@ from turbopi.checkpoint import convert, open_checkpoint
 from turbopi.models.pi0.reference import FloatPrecision
 from turbopi.preprocess.tokenizer import load_tokenizer
 from turbopi.support.errors import CheckpointError, ConfigError, TokenizerError
+from turbopi.support.reading import read_json
 
 V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 
@@ -61,6 +62,23 @@ def test_a_hub_name_is_recognised() -> None:
         CheckpointError, match=r"no folder lerobot/pi05_base.*hf download lerobot/pi05_base --local-dir"
     ):
         open_checkpoint("lerobot/pi05_base")
+    with pytest.raises(CheckpointError, match=r"no folder \.\./pi05_base$"):  # no name on the hub
+        open_checkpoint("../pi05_base")
+
+
+def test_what_one_has_no_permission_for_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of a download that isn't complete, and no file that nobody has named."""
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(CheckpointError, match=f"{tmp_path} can't be read: you have no permission$"):
+        open_checkpoint(tmp_path)
+    monkeypatch.undo()
+
+    def denied(path: object) -> object:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("turbopi.support.reading.files.os.stat", denied)
+    with pytest.raises(CheckpointError, match=r"config\.json can't be read: Permission denied$"):
+        read_json(tmp_path / "config.json", hint="; is the download complete?")
 
 
 def test_paths_that_hold_no_checkpoint_say_what_is_there(tmp_path: Path) -> None:

@@ -159,6 +159,11 @@ def test_inspect_shows_lerobots_statistics_before_the_vision_heads_are_known(
     assert "91 tensors, 271.4 kB" in shown
 
 
+def test_inspect_says_that_lerobots_images_may_come_as_cameras_give_them(tmp_path: Path) -> None:
+    shown = text_of(turbopi("inspect", GoldenCase(GOLDEN_LEROBOT / "mean_std").assemble(tmp_path)).stdout)
+    assert "float32[3, 224, 224] in [0, 1], or uint8[height, width, 3]; any size" in shown
+
+
 def test_inspect_takes_the_normalization_of_a_turbopi_json_that_lacks_the_vision_heads(tmp_path: Path) -> None:
     folder = GoldenCase(GOLDEN_LEROBOT / "mean_std").assemble(tmp_path)
     (folder / "turbopi.json").write_text(json.dumps({"normalization": "identity"}))

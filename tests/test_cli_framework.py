@@ -4,6 +4,7 @@ import inspect
 import io
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -243,6 +244,32 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
 )
 def test_only_arguments_are_worded_as_options(said: str, shown: str) -> None:
     assert as_typed(said) == shown
+
+
+def test_options_are_called_as_the_command_has_them() -> None:
+    said = "take precision 'bf16', or to judge FP8 without such a GPU backend 'emulated_fp8'"
+    shown = "take --precisions bf16, or to judge FP8 without such a GPU --backends emulated_fp8"
+    assert as_typed(said, {"--precisions", "--backends"}) == shown
+    ran = turbopi("bench", "--random-weights", "pi05_tiny", "--precisions", "fp8", "--device", "cpu")
+    assert ran.exit_code == 2 and "take --precisions bf16" in ran.stderr
+
+
+def test_tables_fit_a_narrow_dumb_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((60, 20)))
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    assert Output().console.width == 60
+
+
+@pytest.mark.parametrize(("option", "value"), [("--port", "80x"), ("--port", "99999"), ("--max-batch", "-1")])
+def test_a_wrong_value_is_named(option: str, value: str) -> None:
+    ran = turbopi("serve", option, value)
+    assert ran.exit_code == 2 and value in text_of(ran.stderr)
 
 
 def test_every_argument_of_the_policy_is_an_option_of_the_policy_commands() -> None:

@@ -1,16 +1,20 @@
 """The process around a command: streams that can't write everything, readers that leave, Ctrl-C at any moment."""
 
 import contextlib
+import io
 import os
 import pty
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 
 import cli_helpers  # noqa: F401  # it lets the processes that are started hear Ctrl-C
 import pytest
+
+from turbopi.cli.process import slow_import_reported
 
 TURBOPI = (sys.executable, "-m", "turbopi")
 CLOSED = 141
@@ -144,6 +148,29 @@ MOMENTS = {
         finally: os.kill(os.getpid(), signal.SIGINT); time.sleep(60)
     """,
 }
+
+
+def test_a_slow_import_is_reported_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def reported(terminal: bool, seconds: float) -> bool:
+        said = threading.Event()
+
+        class Stream(io.StringIO):
+            def isatty(self) -> bool:
+                return terminal
+
+            def write(self, text: str) -> int:
+                said.set()
+                return super().write(text)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(sys, "stderr", stream := Stream())
+            patched.delitem(sys.modules, "torch", raising=False)
+            with slow_import_reported(seconds):
+                if terminal and not seconds:
+                    said.wait(60)
+        return stream.getvalue().startswith("importing PyTorch")
+
+    assert reported(True, 0) and not reported(True, 1000) and not reported(False, 0)
 
 
 @pytest.mark.parametrize("moment", MOMENTS)

@@ -137,7 +137,9 @@ def test_a_first_axis_of_three_counts_as_chw() -> None:
 BAD: list[tuple[Any, str]] = [
     (np.zeros((20, 30, 3), np.int64), "cam has dtype int64; send uint8"),
     (np.zeros((20, 30, 3), np.bool_), "cam has dtype bool"),
-    (np.array("image"), "cam has dtype <U5"),
+    (np.array("image"), "cam is text .*data:image/png;base64,.*; send uint8"),
+    (b"\xff\xd8\xff\xe0", "cam is bytes: decode a JPEG or PNG first; send uint8"),
+    (np.array(["a", None], object), "cam has dtype object; send uint8"),
     (np.zeros((20, 30), np.uint8), r"cam has shape \(20, 30\); send one image"),
     (np.zeros((1, 20, 30, 3), np.uint8), "without a batch axis"),
     (np.zeros((0, 30, 3), np.uint8), "cam is empty"),
@@ -147,7 +149,7 @@ BAD: list[tuple[Any, str]] = [
     (np.full((20, 30, 3), -0.1), "cam is a float image with values from -0.1"),
     (np.full((20, 30, 3), np.nan), "cam is a float image with values from nan"),
     ([[[1, 2, 3], [1, 2]]], "cam isn't an image"),
-    (None, "cam has dtype object"),
+    (None, "cam is None; send uint8"),
 ]
 
 
@@ -158,9 +160,13 @@ def test_what_is_no_picture_is_refused(value: Any, message: str) -> None:
             parse(value, "cam")
 
 
-def test_chw_robots_refuse_hwc() -> None:
-    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 3\), but this robot's images are CHW"):
-        parse_chw_image(noise(20, 30, 3), "cam_high")
+def test_chw_robots_take_the_images_of_json_which_are_hwc() -> None:
+    image, ambiguous = noise(20, 30, 3), noise(3, 20, 3)
+    for either in (image, image.transpose(2, 0, 1)):
+        np.testing.assert_array_equal(parse_chw_image(either, "cam_high"), image)
+    np.testing.assert_array_equal(parse_chw_image(ambiguous, "cam_high"), ambiguous.transpose(1, 2, 0))
+    with pytest.raises(ObservationError, match=r"cam_high has shape \(20, 30, 4\), but this robot's images are CHW, "):
+        parse_chw_image(noise(20, 30, 4), "cam_high")
 
 
 # LeRobot's way

@@ -68,6 +68,14 @@ def test_import_turbopi_imports_neither_torch_nor_numpy() -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_import_turbopi_alone_is_short() -> None:
+    """Ctrl-C while it lasts shows a traceback; importlib.abc would import pathlib, urllib and more."""
+    source = str(Path(turbopi.__file__).parents[1])
+    code = f"import sys; sys.path.append({source!r}); import turbopi; print('pathlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-ISc", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_without_pytorch_a_policy_is_refused_in_words() -> None:
     """A robot's computer has Turbo-Pi's client alone."""
     code = "import sys; sys.modules['torch'] = None\nimport turbopi.realtime.client\nfrom turbopi import UnifiedPolicy"

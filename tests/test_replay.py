@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from checkpoint_helpers import lerobot_copy, write_json
 from cli_helpers import refusal, turbopi
 from PIL import Image
 from replay_data import EVERY, write_npz
@@ -367,6 +368,12 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     data = write_npz(tmp_path / "data")
     report = ("--report", tmp_path / "report")
     assert "there is no dataset" in refused(tmp_path / "absent", SMALL_POLICY, *report)
+    fetch = "hf download --repo-type dataset lerobot/absent --local-dir DIR"
+    assert fetch in refused("lerobot/absent", SMALL_POLICY, *report)
+    (tmp_path / "lerobots" / "meta").mkdir(parents=True)
+    (tmp_path / "lerobots" / "meta" / "info.json").write_text("{}")
+    inside = refused(tmp_path / "lerobots" / "meta", SMALL_POLICY, *report)
+    assert f"is inside a LeRobotDataset; give its folder, {tmp_path / 'lerobots'}" in inside
     assert "the dataset comes first" in refused(SMALL_POLICY, data, *report)
     (tmp_path / "empty").mkdir()
     assert "is no dataset; expected a LeRobotDataset" in refused(tmp_path / "empty", SMALL_POLICY, *report)
@@ -470,6 +477,31 @@ def test_a_recording_is_compared_with_its_own_answers(
     document = replayed(run.parent, every=1)
     assert document.policies[0].relative.max == 0, "the same weights, inputs and noise"
     assert document.verdict.level == "follows" and any("not what a person did" in note for note in document.notes)
+
+
+class _Letters:
+    """A tokenizer: a token a letter."""
+
+    def encode(self, text: str, add_bos: bool) -> list[int]:
+        return [2, *(ord(letter) % 500 for letter in text)]
+
+
+def test_calls_without_a_camera_are_answered_as_they_were_served(tmp_path: Path) -> None:
+    """It came late, or dropped out: LeRobot masks it."""
+    checkpoint, run = lerobot_copy(tmp_path / "checkpoint"), tmp_path / "recordings" / "20260101T000000Z"
+    write_json(checkpoint / "turbopi.json", {"vision_heads": 4})
+    policy = UnifiedPolicy(checkpoint, device="cpu", precision="f32", tokenizer=_Letters(), num_denoising_steps=1)
+    run.mkdir(parents=True)
+    for number, without in enumerate(["image2", None, "image", None]):
+        observation = policy.example_observation(number)
+        observation.pop(f"observation.images.{without}", None)
+        answer = policy.infer(observation, seed=number)
+        save_call(run / f"{number:06d}.npz", RecordedCall(observation, answer, 0.0))
+    data = open_dataset(run.parent)
+    replay = Replay(policy, data, data.episodes, Settings({}, changed=4))
+    found = replay.run(select(data.episodes, 1, 1), lambda: None)
+    np.testing.assert_allclose(found.predicted, found.recorded, atol=1e-5)
+    assert found.changed == [0, 1, 3] and "the first observation has nothing called" in replay.notes[0]
 
 
 def test_hdf5_episodes_are_alohas(tmp_path: Path) -> None:

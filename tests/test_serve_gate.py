@@ -195,10 +195,15 @@ def test_nothing_but_get_is_answered(path: str) -> None:
         ):
             for headers in ((), UPGRADE):
                 status, answer = await said(server, f"{method} {path} HTTP/1.1", *headers)
+                if method == "POST":
+                    assert status == 404 and b"POST goes to /v1/actions alone" in answer, headers
+                    continue
                 assert status in (405, 0), (method, headers)
                 assert not answer or b"\r\nAllow: GET\r\n" in answer
                 assert method != "HEAD" or not answer.partition(b"\r\n\r\n")[2]
         assert (await said(server, "GET /healthz HTTP/1.1"))[0] == 200
+        status, answer = await said(server, "GET /v1/actions HTTP/1.1")
+        assert status == 405 and b"\r\nAllow: POST\r\n" in answer and b"POST an observation to /v1/actions" in answer
 
     served(test)
 

@@ -205,6 +205,7 @@ def test_a_full_disk_loses_calls_and_not_the_server(
 
     monkeypatch.setattr(np, "savez", savez)
     counted: list[str] = []
+    caplog.set_level("INFO", "turbopi")
     recorder = Recorder(tmp_path, {}, count=counted.append)
     recorder.put({"n": 0}, RESULT, size=1)
     recorder.put({"n": object()}, RESULT, size=1)
@@ -214,7 +215,7 @@ def test_a_full_disk_loses_calls_and_not_the_server(
     recorder.put({"n": 2}, RESULT, size=1)
     recorder.close()
     assert counted == ["failed", "failed", "written"]
-    assert "1 calls couldn't be recorded" in caplog.text
+    assert "1 calls couldn't be recorded" in caplog.text and "; 2 are lost" in caplog.text
     assert "No space left on device" in caplog.text
     assert sorted(path.name for path in recorder.folder.iterdir()) == ["000002.npz", "index.jsonl", "manifest.json"]
 

@@ -1,5 +1,6 @@
 """What arrives and what leaves is judged: planted mistakes are named at once, and good runs have no note."""
 
+import itertools
 import json
 import logging
 import pickle
@@ -15,7 +16,7 @@ import torch
 from policy_helpers import policy_on
 
 from turbopi import UnifiedPolicy, open_checkpoint
-from turbopi.backends import Sample
+from turbopi.backends import Sample as Sampled
 from turbopi.checkpoint.norm_stats import FeatureStats
 from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.ranges import TrainingRange
@@ -29,6 +30,7 @@ from turbopi.policy.watch import (
     REPEAT_SECONDS,
     SUSTAINED,
     Reading,
+    Sample,
     Watch,
 )
 from turbopi.realtime import RealTimeExecutor
@@ -55,8 +57,8 @@ class Fixed:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def sample(self, observation: Any, *_: Any, **__: Any) -> Sample:
-        return Sample(torch.from_numpy(np.stack([self.actions] * len(observation.state))), {})
+    def sample(self, observation: Any, *_: Any, **__: Any) -> Sampled:
+        return Sampled(torch.from_numpy(np.stack([self.actions] * len(observation.state))), {})
 
 
 @pytest.fixture(scope="module")
@@ -347,6 +349,23 @@ def test_another_resolution_is_named(policy: UnifiedPolicy) -> None:
     policy.infer(seen, seed=0)
     (note,) = notes_in(policy.infer({**seen, BASE: seen[BASE][::2, ::2].copy()}, seed=0))
     assert note.kind == "camera_size" and "128 x 128 pixels, before they were 256 x 256" in note.text
+
+
+def test_a_camera_that_drops_out_is_named_until_it_is_back_or_a_new_episode_begins() -> None:
+    watch, calls = Watch(), itertools.count()
+
+    def notes(*cameras: str) -> list[Any]:
+        pixels = bytes(range(first := next(calls), first + 12))
+        return watch.notes(Reading((0.0,), images={name: Sample((2, 2), pixels) for name in cameras}))
+
+    assert notes("top") == [], "a robot may have fewer cameras than its checkpoint"
+    assert notes("top", "wrist") == []
+    for _ in range(2):
+        (note,) = notes("top")
+        assert (note.kind, note.names) == ("camera_missing", ("wrist",)) and "no image of camera wrist" in note.text
+    assert notes("top", "wrist") == []
+    watch.reset()
+    assert notes("top") == []
 
 
 def test_exchanged_cameras_are_named_when_they_are_exchanged_after_the_start(policy: UnifiedPolicy) -> None:

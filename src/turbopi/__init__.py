@@ -4,7 +4,6 @@ The names in `__all__` are the public interface, with those that docs/api.md lis
 """
 
 import importlib
-import importlib.abc
 import importlib.util
 import os
 import sys
@@ -14,6 +13,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from importlib.abc import Loader, MetaPathFinder
+
     from turbopi.checkpoint import open_checkpoint
     from turbopi.config import PolicyConfig
     from turbopi.policy.policy import UnifiedPolicy
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     )
 
     __version__: str
+else:  # importlib.abc imports many modules, and Ctrl-C while turbopi/__init__.py runs shows a traceback
+    MetaPathFinder = type("MetaPathFinder", (), {})
+    Loader = type("Loader", (), {})
 
 __all__ = [
     "ActionError",
@@ -112,7 +116,7 @@ _MOVED = {
 }
 
 
-class _MovedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+class _MovedModules(MetaPathFinder, Loader):
     """Finds a moved module, or one inside a moved folder, under its name of 0.1: the same module object."""
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:

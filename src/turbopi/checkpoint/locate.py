@@ -1,5 +1,6 @@
 """Finding out what a path holds; `nothing_here` says what to do about a folder without weights to read."""
 
+import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from turbopi.checkpoint.quantized_folder import TENSORS
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS, read_index
 from turbopi.support.errors import CheckpointError
 from turbopi.support.files import openpi_cache
+from turbopi.support.hub_cache import is_hub_name
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "quantized", "random"]
 
@@ -98,11 +100,13 @@ def _local(path: str | Path) -> Path:
         raise CheckpointError(f"{text} is an address; Turbo-Pi reads local folders. Fetch it first, with {how}")
     folder = Path(path).expanduser()
     if folder.is_dir():
+        if not os.access(folder, os.R_OK | os.X_OK):
+            raise CheckpointError(f"{folder} can't be read: you have no permission")
         return folder
     if folder.is_file():
         raise CheckpointError(f"{folder} is a file; give the checkpoint's folder, probably {folder.parent}")
     hint = ""
-    if re.fullmatch(r"[\w.-]+/[\w.-]+", text):
+    if is_hub_name(text):
         hint = f". If it is a name on the Hugging Face hub, fetch it first: hf download {text} --local-dir DIR"
     shipped = Path(__file__).parents[1] / "data" / folder.name
     if (shipped / PACKED).is_file():

@@ -26,6 +26,7 @@ from turbopi.checkpoint.target_time import with_target_time
 from turbopi.checkpoint.torch_files import TorchSource
 from turbopi.config import Kind, ModelConfig, Pi0FastConfig, PolicyConfig
 from turbopi.models import FAMILIES, family_of, parameter_shapes
+from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.hub_cache import hub_folder
 
@@ -272,5 +273,13 @@ def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, 
     model = policy.model
     if isinstance(model, ModelConfig | Pi0FastConfig):
         model = model_sizes(source, model, vision_heads=settings.vision_heads, where=location.weights)
-    check_tensors(source, parameter_shapes(model), location.weights)
+    try:
+        check_tensors(source, parameter_shapes(model), location.weights)
+    except CheckpointError as error:
+        if not isinstance(model, SmolVLAConfig):
+            raise
+        raise CheckpointError(
+            f"{error}. The sizes are those of the vision-language model that config.json names (vlm_model_name). If "
+            'the policy was trained with another, put its folder into a turbopi.json there: {"vlm": "/path/to/it"}'
+        ) from error
     return replace(policy, model=model)

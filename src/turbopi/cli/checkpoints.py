@@ -132,6 +132,8 @@ def robot_pipeline(checkpoint: "Checkpoint", robot: Any, default_prompt: str | N
 
 def _input_row(info: dict[str, Any], key: str, kind: str) -> str:
     """What is sent under a robot's key; of an image also which of the model's cameras it is."""
+    if kind.startswith("float32[3, "):  # LeRobot's, which takes either
+        kind += " in [0, 1], or uint8[height, width, 3]; any size"
     camera = info["cameras"].get(key, key)
     return kind if camera == key else f"{kind}, the model's {camera}"
 

@@ -4,6 +4,8 @@ import importlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from turbopi.cli.process import slow_import_reported
+
 Level = Literal["OK", "WARN", "FAIL"]
 
 # Weights of the full-size model (docs: 3.617 B parameters)
@@ -23,7 +25,8 @@ class Row:
 def imported_torch() -> Any:
     """PyTorch, or None where it can't be imported (check_torch says so)."""
     try:
-        return importlib.import_module("torch")
+        with slow_import_reported():
+            return importlib.import_module("torch")
     except Exception:
         return None
 

@@ -13,9 +13,10 @@ import json
 import logging
 import math
 import os
+import shutil
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
@@ -107,6 +108,8 @@ def new_console(*, stderr: bool) -> Console:
     console = Console(stderr=stderr)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = PLAIN_WIDTH
+    elif console.is_dumb_terminal:  # for which rich takes 80
+        console.size = shutil.get_terminal_size()
     return console
 
 
@@ -193,7 +196,7 @@ def describe(
             _refuse_nan(given)
             function(**values)
 
-        with_errors_reported(work, debug=debug, owner=owner)
+        with_errors_reported(work, debug=debug, owner=owner, options=options)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     own = inspect.signature(function, eval_str=True).parameters.values()
@@ -209,6 +212,7 @@ def describe(
         parameters.append(inspect.Parameter("help_all", keyword, default=False, annotation=_HelpAll))
         cls = type(cls.__name__, (cls,), {"common": tuple(common)})
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    options = {f"--{parameter.name.replace('_', '-')}" for parameter in parameters}
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     del run.__wrapped__  # or typer would read the undecorated signature
     return Described(run, cls, _unwrapped(function), _epilog(examples) if examples else None)
@@ -232,8 +236,12 @@ def _epilog(examples: Sequence[str]) -> str:
     return "\n\n".join(["[bold]Examples[/]", *lines])
 
 
-def with_errors_reported(work: Callable[[], None], *, debug: bool, owner: str = "Turbo-Pi's own") -> None:
-    """Run a command; an error becomes one red line on stderr and an exit code, and a fault of `owner` a traceback."""
+def with_errors_reported(
+    work: Callable[[], None], *, debug: bool, owner: str = "Turbo-Pi's own", options: Collection[str] = ()
+) -> None:
+    """Run a command with these options; an error becomes one red line on stderr and an exit code, and a fault of
+    `owner` a traceback.
+    """
     rich.reconfigure(stderr=True)  # progress bars of the library use rich's own console
     log_to_stderr()
     try:
@@ -246,7 +254,7 @@ def with_errors_reported(work: Callable[[], None], *, debug: bool, owner: str = 
         if isinstance(error, BrokenPipeError) and (is_closed_pipe(sys.stdout) or is_closed_pipe(sys.stderr)):
             forget_output()
             raise typer.Exit(OUTPUT_CLOSED) from None
-        message = _users_message(error)
+        message = _users_message(error, options)
         if debug or message is None:
             traceback.print_exc()
         if message is None:
@@ -269,10 +277,10 @@ def _exit_code(error: Exception) -> int:
     return OUR_FAULT if _users_message(error) is None else BAD_INPUT
 
 
-def _users_message(error: Exception) -> str | None:
+def _users_message(error: Exception, options: Collection[str] = ()) -> str | None:
     """What to tell of an error that isn't a fault in the program; None if it is one."""
     if isinstance(error, TurboPiError):
-        return as_typed(str(error))
+        return as_typed(str(error), options)
     if isinstance(error, OSError) and error.filename is not None:  # a file of the user's: unwritable, vanished, …
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     if isinstance(error, OSError) and error.errno in _NO_ROOM:  # of writes, which know no name

@@ -23,6 +23,15 @@ class Command(TyperCommand):
 
     common: tuple[str, ...] = ()
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            problems = getattr(error.__cause__, "errors", None)  # pydantic's, whose message leaves the value out
+            if problems is not None and "input" in (first := problems()[0]):
+                error.message += f", not {str(first['input'])[:80]!r}"
+            raise
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
         show_help(self, ctx, whole=not self.common)
 

@@ -9,7 +9,7 @@ import typer
 
 from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
-from turbopi.cli.process import interrupts_end_at_once
+from turbopi.cli.process import interrupts_end_at_once, slow_import_reported
 from turbopi.cli.typed import as_typed
 from turbopi.config import PRESETS, typed_grid
 from turbopi.support.errors import ConfigError
@@ -128,7 +128,8 @@ class WeightOptions:
         self.check(checkpoint)
         config = "auto" if self.config is None else self.config
         with interrupts_end_at_once():
-            from turbopi.checkpoint import open_checkpoint, random_checkpoint
+            with slow_import_reported():
+                from turbopi.checkpoint import open_checkpoint, random_checkpoint
 
             if self.random_weights is not None:
                 return random_checkpoint(self.random_weights, self.weights_seed or 0, config)

@@ -94,6 +94,19 @@ def interrupts_end_at_once() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextlib.contextmanager
+def slow_import_reported(seconds: float = 2.0) -> Iterator[None]:
+    """On a terminal, a line if PyTorch isn't imported yet and this block takes longer than `seconds`."""
+    timer = threading.Timer(seconds, print, ("importing PyTorch …",), {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    if "torch" not in sys.modules and sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def _on_interrupt(handler: Callable[..., None]) -> Any:
     """Install a handler of SIGINT, unless the process was started with SIGINT ignored; returns the one before."""
     before = signal.getsignal(signal.SIGINT)

@@ -1,6 +1,7 @@
 """The library's messages in the words of the command line: it says `config=`, and the user typed `--config`."""
 
 import re
+from collections.abc import Collection
 
 # arguments of the Python interface whose messages reach the command line, and the options that they come from
 OF_POLICIES = {
@@ -56,11 +57,14 @@ _ARGUMENT = re.compile(  # config=, config='auto', queue_limit=-1
     rf"""(?<![\w/.-])({"|".join(OPTIONS)})=(?:(['"])(.*?)\2|([^\s,;:()'"]+(?<!\.)))?"""
 )
 _ADVICE = re.compile(r"\b(?:use|take) [^;:]*")  # use backend 'pytorch' or 'onnx'
+_OPTION = re.compile(r"--[a-z][a-z-]*")
 _ADVISED = re.compile(r"\b(backend|precision|solver|time grid) ('\w+'(?:(?:, | or )'\w+')*)")
 
 
-def as_typed(message: str) -> str:
+def as_typed(message: str, options: Collection[str] = ()) -> str:
     """`message` with arguments as the options that stand for them on the command line.
+
+    options   the command's own: where it has --backends alone, --backend is called so
 
     An argument is `name=`, `name='value'` or `name=1.5`; or in advice, after "use" or "take", `backend 'value'`.
     """
@@ -73,4 +77,5 @@ def as_typed(message: str) -> str:
         return f"{OPTIONS[match[1].replace(' ', '_')]} {match[2].replace(chr(39), '')}"
 
     message = _ARGUMENT.sub(option, message)
-    return _ADVICE.sub(lambda advice: _ADVISED.sub(advised, advice[0]), message)
+    message = _ADVICE.sub(lambda advice: _ADVISED.sub(advised, advice[0]), message)
+    return _OPTION.sub(lambda it: f"{it[0]}s" if it[0] not in options and f"{it[0]}s" in options else it[0], message)

@@ -274,6 +274,10 @@ class CameraWatch:
         """What there is to say of a call's images."""
         found: list[Note] = []
         images, state = reading.images, reading.state
+        if 0 < len(images) < len(self._cameras) and all(name in self._cameras for name in images):
+            missing = tuple(name for name in self._cameras if name not in images)
+            text = f"no image of camera {', '.join(missing[:4])} came, as in earlier calls: the model acts without it"
+            found.append(Note("camera_missing", missing, text))
         same = [name for name, one in images.items() if not self._changed(name, one, state, found)]
         for name in same:
             camera = self._cameras[name]

@@ -304,10 +304,10 @@ class Pipeline:
     def _choose_prompt(self, sample: Incoming) -> None:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt
         if prompt is None:
+            key = next((key for key, value in self.example().items() if isinstance(value, str)), "prompt")
             raise ObservationError(
-                f"the observation has no prompt. It has {listed(keys_of(sample.observation))}. Send the task as text: "
-                "most robots read 'prompt', LeRobot's read 'task', your own what it says. Or give the policy a default "
-                "one: --default-prompt, or default_prompt in turbopi.json"
+                f"the observation has no prompt. It has {listed(keys_of(sample.observation))}. Send the task as text "
+                f"under {key!r}, or give the policy a default one: --default-prompt, or default_prompt in turbopi.json"
             )
         sample.prompt = read_prompt(prompt)
 

@@ -20,7 +20,7 @@ NOTES = PREFIX + "notes"  # of an answer: a list of {"kind", "names", "text"}
 NOTE_KINDS = (  # docs/safety.md says when
     *("state_range", "action_range", "action_clipped"),
     *("camera_black", "camera_frozen", "camera_size", "camera_exchanged", "camera_channels"),
-    *("camera_turned", "memory"),
+    *("camera_turned", "camera_missing", "memory"),
 )
 MOST_NOTES = 32  # of an answer: others aren't read
 MAX_SESSION = 64  # characters

@@ -92,7 +92,8 @@ class Recorder:
             logger.warning("the recording in %s is incomplete: the disk doesn't answer", self.folder)
         elif self._trimmed is not None:
             self._trimmed.report()
-        logger.info("recorded %d calls in %s", self.written, self.folder)
+        lost = self.dropped + self.failed
+        logger.info("recorded %d calls in %s%s", self.written, self.folder, f"; {lost} are lost" if lost else "")
 
     def _write_all(self) -> None:
         for number in itertools.count():

@@ -13,7 +13,7 @@ import numpy as np
 
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.replay.episodes import PROMPT
-from turbopi.robots.base import find, keys_of, listed
+from turbopi.robots.base import find, has, keys_of, listed
 from turbopi.support.errors import ConfigError, ObservationError
 
 _STATES = ("state", "proprio", "qpos")  # what a state of all numbers is called
@@ -28,7 +28,7 @@ class KeyMap:
     channels_first   which of them take [3, h, w]
     prompt     the robot's key of the task
     unread     cameras of the dataset that the robot doesn't read
-    absent     keys of the robot that the dataset lacks
+    absent     keys of the robot that the dataset's first observation lacks
     """
 
     joined: Mapping[str, str]
@@ -39,9 +39,14 @@ class KeyMap:
     absent: tuple[str, ...]
 
     def observation(self, recorded: Mapping[str, Any], task: str | None) -> dict[str, Any]:
-        """A recorded observation under the robot's keys; `task` instead of the recorded one."""
+        """A recorded observation under the robot's keys, those that it has; `task` instead of the recorded one.
+
+        A key that the first observation lacks is read by its own name.
+        """
         made: dict[str, Any] = {}
-        for key, source in self.joined.items():
+        for key, source in {**dict(zip(self.absent, self.absent, strict=True)), **self.joined}.items():
+            if not has(recorded, source):
+                continue
             value = find(recorded, source)
             if key in self.channels_first and np.ndim(value) == 3 and value.shape[-1] == 3:
                 value = np.ascontiguousarray(value.transpose(2, 0, 1))

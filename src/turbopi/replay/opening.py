@@ -7,6 +7,7 @@ from turbopi.replay.episodes import Dataset
 from turbopi.replay.lerobot_dataset import INFO, LeRobotDataset
 from turbopi.replay.recorded_calls import RecordedCalls
 from turbopi.support.errors import ConfigError
+from turbopi.support.hub_cache import is_hub_name
 from turbopi.support.reading import Npz
 
 EXPECTED = (
@@ -21,7 +22,11 @@ def open_dataset(path: Path, action: str | None = None) -> Dataset:
     Raises ConfigError if it is none that is known, ObservationError if it is damaged.
     """
     if not path.exists():
-        raise ConfigError(f"there is no dataset {path}; expected {EXPECTED}")
+        fetch = f"hf download --repo-type dataset {path} --local-dir DIR"
+        hint = f". If it is a name on the Hugging Face hub, fetch it first: {fetch}" if is_hub_name(str(path)) else ""
+        raise ConfigError(f"there is no dataset {path}; expected {EXPECTED}{hint}")
+    if above := next((folder for folder in path.absolute().parents if (folder / INFO).is_file()), None):
+        raise ConfigError(f"{path} is inside a LeRobotDataset; give its folder, {above}")
     if (path / INFO).is_file():
         return LeRobotDataset(path, action)
     if path.is_dir() and (found := next((one for one in sorted(path.glob("*/")) if (one / INFO).is_file()), None)):

@@ -197,8 +197,8 @@ class Replay:
         if self.keys.absent:
             unread = f"; cameras of it that aren't read: {', '.join(self.keys.unread)}" if self.keys.unread else ""
             found.append(
-                f"the dataset has nothing called {', '.join(self.keys.absent)}, which the policy does without{unread}. "
-                "--rename says which is which"
+                f"the first observation has nothing called {', '.join(self.keys.absent)}, which the policy does "
+                f"without{unread}. --rename says which is which"
             )
         elif self.keys.unread:
             found.append(f"cameras of the dataset that the policy doesn't read: {', '.join(self.keys.unread)}")
@@ -243,7 +243,8 @@ class Replay:
                     if isinstance(chunk, ActionError):
                         broken.append(Broken(moment.episode.name, moment.step, str(chunk)))
                     else:
-                        if first + row in to_change and (own := self._varied(observation, seeds[row])) is not None:
+                        own = self._varied(observation, seeds[row]) if first + row in to_change else None
+                        if own is not None:
                             changed.append(len(found))
                             for variation, other in zip(self.variations, own, strict=True):
                                 varied[variation.name].append(other)
@@ -305,7 +306,9 @@ class Replay:
         return [result["actions"][:, : self.width] for result in results]
 
     def _varied(self, observation: Mapping[str, Any], seed: int) -> list[np.ndarray] | None:
-        """The chunk with each variation of the inputs; None if one of them is none."""
+        """The chunk with each variation of the inputs; None if one of them is none, or a camera is missing."""
+        if not all(key in observation for key in self.keys.cameras):
+            return None
         chunks = []
         for variation in self.variations:
             (chunk,) = self._infer([variation.change(observation)], [seed])

@@ -29,12 +29,13 @@ def parse_image(value: object, name: str) -> np.ndarray:
 
 
 def parse_chw_image(value: object, name: str) -> np.ndarray:
-    """One image that must be CHW, as openpi's ALOHA clients send it: uint8[h, w, 3]."""
+    """One image as openpi's ALOHA clients send it, CHW: uint8[h, w, 3]. HWC, as JSON has it, where only that is RGB."""
     image = check_image(value, name)
+    if image.shape[0] != 3 and image.shape[-1] == 3:
+        return to_uint8(image, name)
     if image.shape[0] != 3:
         raise ObservationError(
-            f"{name} has shape {image.shape}, but this robot's images are CHW: (3, height, width). "
-            f"Send numpy.transpose(image, (2, 0, 1)) of an HWC image"
+            f"{name} has shape {image.shape}, but this robot's images are CHW, (3, height, width), or HWC"
         )
     return to_uint8(image.transpose(1, 2, 0), name)
 
@@ -58,7 +59,7 @@ def check_image(value: object, name: str) -> np.ndarray:
     except Exception as error:
         raise ObservationError(f"{name} isn't an image: {error}") from error
     if image.dtype != _UINT8 and image.dtype.kind != "f":
-        raise ObservationError(f"{name} has dtype {image.dtype}; send uint8 in [0, 255] or float in [0, 1]")
+        raise ObservationError(f"{name} {_what(value, image)}; send uint8 in [0, 255] or float in [0, 1]")
     if image.ndim != 3:
         raise ObservationError(
             f"{name} has shape {image.shape}; send one image, (height, width, 3) or (3, height, width), "
@@ -67,6 +68,17 @@ def check_image(value: object, name: str) -> np.ndarray:
     if image.size == 0:
         raise ObservationError(f"{name} is empty: its shape is {image.shape}")
     return image
+
+
+def _what(value: object, image: np.ndarray) -> str:
+    """What came instead of an image, for a message."""
+    if value is None:
+        return "is None"
+    if image.dtype.kind == "S":
+        return "is bytes: decode a JPEG or PNG first"
+    if image.dtype.kind == "U":
+        return "is text (images in JSON begin with data:image/png;base64, or data:image/jpeg;base64,)"
+    return f"has dtype {image.dtype}"
 
 
 def check_hwc(value: object, name: str) -> np.ndarray:

@@ -9,6 +9,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.http_api import ACTIONS
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 from turbopi.serve.options import check_key
@@ -77,6 +78,10 @@ class Gate:
             return self._document(connection, request, CONTENT_TYPE, self._metrics.text())
         if path in self.documents and not request.headers.get_all("Upgrade"):
             return self._document(connection, request, "application/json", self.documents[path])
+        if path == ACTIONS and not request.headers.get_all("Upgrade"):
+            response = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, f"POST an observation to {ACTIONS}.\n")
+            response.headers["Allow"] = "POST"
+            return response
         host = _only(request, "Host")
         for origin in request.headers.get_all("Origin"):  # of browsers, always; most robots send none
             if host is None or not self._hosts.lets_in(origin, host, request.headers):
@@ -132,7 +137,7 @@ def _protocol_refusal(connection: ServerConnection, request: Request) -> Respons
     """The answer to what isn't a GET of HTTP/1.1. websockets before 17 closes such a connection by itself."""
     method, version = getattr(request, "method", "GET"), getattr(request, "protocol", "HTTP/1.1")
     if method != "GET":
-        response = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "This server answers GET alone.\n")
+        response = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, f"This server answers GET, and POST {ACTIONS}.\n")
         response.headers["Allow"] = "GET"
         if method == "HEAD":
             response.body = b""

@@ -64,7 +64,7 @@ KINDS = sorted(
     {kind for _, kind, _ in REFUSED} | {kind for kind, _ in CLOSED.values()} | {*AT_THE_DOOR.values(), "policy"}
 )
 
-_POST = b"POST /v1/"
+_POST = b"POST "
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f\x7f]")
 _OWN_HEADERS = (b"connection", b"upgrade", b"expect", b"te", b"trailer", b"keep-alive", b"proxy-connection")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="turbopi-json")  # one body at a time, beside the event loops

@@ -117,7 +117,7 @@ def _value(value: Any, metadata: Mapping[str, Any]) -> dict[str, Any]:
         return {"type": "object", "properties": {key: _value(item, metadata) for key, item in value.items()}}
     if not isinstance(value, np.ndarray):
         return dict(_TEXT) if isinstance(value, str) else {}
-    if value.dtype == np.uint8 and value.ndim == 3:
+    if value.ndim == 3:  # uint8, or float as LeRobot's
         return {
             "type": "string",
             "pattern": "^data:image/(png|jpeg);base64,",

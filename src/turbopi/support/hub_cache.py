@@ -10,7 +10,7 @@ def hub_folder(name: str) -> Path | None:
 
     The cache: $HF_HUB_CACHE, $HF_HOME/hub, or ~/.cache/huggingface/hub, as in huggingface_hub.
     """
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
+    if not is_hub_name(name):
         return None
     repository = _cache() / f"models--{name.replace('/', '--')}"
     snapshots = repository / "snapshots"
@@ -19,6 +19,11 @@ def hub_folder(name: str) -> Path | None:
     except (OSError, UnicodeDecodeError):
         there = [one for one in snapshots.iterdir() if one.is_dir()] if snapshots.is_dir() else []
         return max(there, key=lambda one: one.stat().st_mtime, default=None)
+
+
+def is_hub_name(text: str) -> bool:
+    """Whether it may be a repository's name, "owner/name", and is no path such as ../name."""
+    return re.fullmatch(r"\w[\w.-]*/[\w.-]+", text) is not None
 
 
 def _cache() -> Path:

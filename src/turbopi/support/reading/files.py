@@ -56,7 +56,7 @@ def read_bytes(file: str | Path, error: Error = CheckpointError, *, limit: int, 
         with open_file(file, error, hint=hint) as stream:
             data = stream.read(limit + 1)
     except OSError as reason:
-        raise error(f"{file} can't be read: {reason.strerror or reason}{hint}") from reason
+        raise error(f"{file} can't be read: {reason.strerror or reason}{_fitting(hint, reason)}") from reason
     if len(data) > limit:
         raise error(f"{file} has more than {limit} bytes, the most that is read of a file of its kind")
     if (found := failed_download(data)) is not None:
@@ -114,8 +114,13 @@ def open_file(file: str | Path, error: Error = CheckpointError, *, hint: str = "
     except (OSError, ValueError) as reason:  # ValueError: a name with a NUL in it
         what = reason.strerror if isinstance(reason, OSError) else reason
         name = file if str(file).isprintable() and len(str(file)) < 500 else shown(str(file))
-        raise error(f"{name} can't be read: {what}{hint}") from reason
+        raise error(f"{name} can't be read: {what}{_fitting(hint, reason)}") from reason
     raise error(f"{file} can't be read: it is {kind}{hint}")
+
+
+def _fitting(hint: str, reason: Exception) -> str:
+    """The hint, unless the reason says it all."""
+    return "" if isinstance(reason, PermissionError) else hint
 
 
 def file_inside(folder: Path, name: object, where: object, error: Error = CheckpointError) -> Path:

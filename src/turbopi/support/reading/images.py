@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from turbopi.support.errors import ObservationError
-from turbopi.support.reading.files import open_file
+from turbopi.support.reading.files import one_line, open_file
 
 IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")  # of files: each is decoded by Pillow itself, in this process
 MAX_PIXELS = 50_000_000  # of an image in a file
@@ -42,7 +42,6 @@ def decode_image(
     except ObservationError:
         raise
     except Exception as reason:  # damage makes Pillow's decoders raise a dozen classes
-        why = " ".join(str(reason).split())[:200].replace(repr(stream), "it")
-        raise ObservationError(
-            f"{name} is neither a readable image nor .npy: {why}. Images are read as " + ", ".join(formats)
-        ) from reason
+        what = "neither a readable image nor .npy" if formats is IMAGE_FORMATS else "no readable image"
+        why = "damaged, or of another format" if isinstance(reason, UnidentifiedImageError) else one_line(reason)
+        raise ObservationError(f"{name} is {what} ({why}). Images are read as {', '.join(formats)}") from reason
