@@ -4,7 +4,6 @@ The names in `__all__` are the public interface, with those that docs/api.md lis
 """
 
 import importlib
-import importlib.util
 import os
 import sys
 import warnings
@@ -13,8 +12,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from importlib.abc import Loader, MetaPathFinder
-
     from turbopi.checkpoint import open_checkpoint
     from turbopi.config import PolicyConfig
     from turbopi.policy.policy import UnifiedPolicy
@@ -35,9 +32,6 @@ if TYPE_CHECKING:
     )
 
     __version__: str
-else:  # importlib.abc imports many modules, and Ctrl-C while turbopi/__init__.py runs shows a traceback
-    MetaPathFinder = type("MetaPathFinder", (), {})
-    Loader = type("Loader", (), {})
 
 __all__ = [
     "ActionError",
@@ -116,14 +110,14 @@ _MOVED = {
 }
 
 
-class _MovedModules(MetaPathFinder, Loader):
+class _MovedModules:  # importlib.abc's classes take long to import, and Ctrl-C meanwhile shows a traceback
     """Finds a moved module, or one inside a moved folder, under its name of 0.1: the same module object."""
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
         for old, new in _MOVED.items():
             if fullname == f"turbopi.{old}" or fullname.startswith(f"turbopi.{old}."):
                 moved = f"turbopi.{new}{fullname.removeprefix(f'turbopi.{old}')}"
-                return importlib.util.spec_from_loader(fullname, self, origin=moved)
+                return ModuleSpec(fullname, self, origin=moved)  # type: ignore[arg-type]
         return None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:

@@ -81,6 +81,7 @@ class LeRobotFolder:
     keys: ClassVar[Keys] = PI
     own_settings: ClassVar[frozenset[str]] = frozenset()  # keys of a turbopi.json that are for this type alone
     writes_text: ClassVar[bool] = False
+    sizes_hint: ClassVar[str] = ""  # what to do about weights of other sizes
 
     def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG

@@ -61,6 +61,10 @@ class SmolVLAFolder(LeRobotFolder):
 
     keys: ClassVar[Keys] = SMOLVLA
     own_settings: ClassVar[frozenset[str]] = frozenset({"vlm", "vision_positions"})
+    sizes_hint: ClassVar[str] = (
+        "The sizes are those of the vision-language model that config.json names (vlm_model_name). If the policy was "
+        'trained with another, put its folder into a turbopi.json there: {"vlm": "/path/to/it"}'
+    )
 
     @classmethod
     def names(cls, folder: Path) -> Names:

@@ -26,7 +26,6 @@ from turbopi.checkpoint.target_time import with_target_time
 from turbopi.checkpoint.torch_files import TorchSource
 from turbopi.config import Kind, ModelConfig, Pi0FastConfig, PolicyConfig
 from turbopi.models import FAMILIES, family_of, parameter_shapes
-from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.hub_cache import hub_folder
 
@@ -276,10 +275,7 @@ def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, 
     try:
         check_tensors(source, parameter_shapes(model), location.weights)
     except CheckpointError as error:
-        if not isinstance(model, SmolVLAConfig):
-            raise
-        raise CheckpointError(
-            f"{error}. The sizes are those of the vision-language model that config.json names (vlm_model_name). If "
-            'the policy was trained with another, put its folder into a turbopi.json there: {"vlm": "/path/to/it"}'
-        ) from error
+        if location.format == "lerobot" and (hint := _lerobot_folder(location).sizes_hint):
+            raise CheckpointError(f"{error}. {hint}") from error
+        raise
     return replace(policy, model=model)
