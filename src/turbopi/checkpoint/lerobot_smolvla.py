@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from turbopi.checkpoint import lerobot_versions as versions
 from turbopi.checkpoint import lerobot_vlm as vlm_config
-from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
+from turbopi.checkpoint.lerobot import CONFIG, USE_LEROBOT, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
@@ -34,7 +34,6 @@ _COUNTS = {  # keys, and the limits of turbopi.config for them
     "max_action_dim": "action_dim",
 }
 ALOHA_JOINTS = 14
-_USE_LEROBOT = "Run this checkpoint with LeRobot's own policy"
 _TOKENIZER, _TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
 
 
@@ -178,11 +177,11 @@ class SmolVLAFolder(LeRobotFolder):
                 "text_config and vision_config with their sizes"
             ) from error
         if other is not None:
-            raise CheckpointError(f"{source} has {other}. {_USE_LEROBOT}")
+            raise CheckpointError(f"{source} has {other}. {USE_LEROBOT}")
         if (problem := _problem(network)) is not None:
             raise CheckpointError(f"{self.file} with the sizes of {source}: {problem}; LeRobot can't run it either")
         if (other := _not_computed(network)) is not None:
-            raise CheckpointError(f"{self.file} with the sizes of {source}: {other}. {_USE_LEROBOT}")
+            raise CheckpointError(f"{self.file} with the sizes of {source}: {other}. {USE_LEROBOT}")
         if versions.smolvla_sums_up_time(self.config.values) and self.settings.values.get("lerobot_semantics") != "0.6":
             return SummedTimes(**{one.name: getattr(network, one.name) for one in fields(network)})
         return network
