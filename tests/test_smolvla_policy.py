@@ -178,6 +178,14 @@ def test_as_many_text_layers_as_there_are_is_what_no_number_of_them_means(hub: P
         assert model.text.depth == 4
 
 
+def test_prompts_are_as_long_as_the_preprocessor_says(hub: Path, tmp_path: Path) -> None:
+    """As in LeRobot, whose fine-tune may have another tokenizer_max_length and the base's processors."""
+    folder, golden = make_checkpoint("long_prompt", tmp_path / "long"), GoldenRuns("long_prompt")
+    edit_json(folder / "config.json", lambda config: config.update(tokenizer_max_length=7))
+    policy = UnifiedPolicy(folder, precision="f32")
+    assert relative(policy.infer(golden.observation(0), noise=golden.noise)["actions"], golden.actions(0)) <= 2e-5
+
+
 def test_what_the_vision_language_models_config_leaves_out_is_transformers_default() -> None:
     """As the published SmolVLM2's does, which any user of LeRobot has in the Hub's cache."""
     whole = PUBLISHED["HuggingFaceTB/SmolVLM2-500M-Video-Instruct"]

@@ -170,7 +170,8 @@ class SmolVLAFolder(LeRobotFolder):
         try:
             vlm, other = vlm_config.completed(found), vlm_config.refused(found)
             depth = _depth(self.config.values, vlm["text_config"])
-            network = from_lerobot({**self.config.values, "num_vlm_layers": depth}, {**vlm, **self._special_tokens()})
+            chosen = {"num_vlm_layers": depth, "tokenizer_max_length": self.pipelines.max_tokens}
+            network = from_lerobot({**self.config.values, **chosen}, {**vlm, **self._special_tokens()})
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise CheckpointError(
                 f"{source} isn't a config of a SmolVLM: {type(error).__name__} at {error}; expected its "
