@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot_golden import GOLDEN, GoldenCase
+from smolvla_golden import relative
 
 pytestmark = pytest.mark.slow
 
@@ -58,7 +59,8 @@ def test_the_stored_cases_are_what_lerobot_computes_now(made: Path) -> None:
     for name in common:
         stored, now = (np.load(folder / name / "expected.npz") for folder in (GOLDEN, made))
         assert stored.files == now.files
-        for key in stored.files:
-            np.testing.assert_allclose(stored[key], now[key], rtol=1e-2, atol=1e-4, err_msg=f"{name}: {key}")
         described = [json.loads((folder / name / "case.json").read_text()) for folder in (GOLDEN, made)]
+        rounded = described[0]["config"].get("dtype") == "bfloat16"  # otherwise on each kind of CPU
+        for key in stored.files:  # of the rms; seen: 4e-7, and in bfloat16 9e-4
+            assert relative(now[key], stored[key]) <= (5e-3 if rounded else 1e-5), f"{name}: {key}"
         assert described[0]["runs"] == described[1]["runs"]

@@ -160,8 +160,9 @@ def test_a_step_that_stands_twice_is_refused(folder: Path, name: str) -> None:
         open_checkpoint(folder)
 
 
-def test_padding_is_masked_whichever_way_it_goes(folder: Path) -> None:
-    edit(folder, PRE, TOKENIZER, padding="longest", padding_side="left", truncation=True)
+@pytest.mark.parametrize("padding", ["longest", "do_not_pad"])
+def test_padding_is_masked_whichever_way_it_goes(folder: Path, padding: str) -> None:
+    edit(folder, PRE, TOKENIZER, padding=padding, padding_side="left", truncation=True)
     assert open_checkpoint(folder).config.model.max_prompt_tokens == 180
 
 

@@ -16,8 +16,9 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.fused_smolvla import FusedSmolVLABackend
 from turbopi.checkpoint import open_checkpoint
+from turbopi.checkpoint.lerobot_vlm import completed, position_rows
 from turbopi.checkpoint.vision_positions import shifted_rows
-from turbopi.models.smolvla.config import SmolVLAConfig
+from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
 from turbopi.preprocess.images import fit_unit, fitted
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, TokenizerError
@@ -145,6 +146,12 @@ def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: py
         ({"resize_imgs_with_padding": None}, "resize_imgs_with_padding = None"),
         ({"num_vlm_layers": 0}, r"missing .*text_model\.layers\.4\..*{\"vlm\": "),  # all six layers of that model
         ({"num_expert_layers": 3}, "3 layers of the expert don't go into 4 text layers"),
+        ({"expert_width_multiplier": 0.6}, "the expert is 9 wide, and the time embedding needs an even number"),
+        ({"resize_imgs_with_padding": [104, 104]}, "13 patches a side, of 104 pixels, aren't a multiple of 4"),
+        (
+            {"resize_imgs_with_padding": [130, 130]},
+            "130 pixels leave 2 beside 16 patches of 8; .* LeRobot's own policy",
+        ),
     ],
 )
 def test_what_is_not_computed_is_refused_by_its_key(
@@ -169,6 +176,65 @@ def test_as_many_text_layers_as_there_are_is_what_no_number_of_them_means(hub: P
         model = open_checkpoint(folder).config.model
         assert isinstance(model, SmolVLAConfig)
         assert model.text.depth == 4
+
+
+def test_prompts_are_as_long_as_the_preprocessor_says(hub: Path, tmp_path: Path) -> None:
+    """As in LeRobot, whose fine-tune may have another tokenizer_max_length and the base's processors."""
+    folder, golden = make_checkpoint("long_prompt", tmp_path / "long"), GoldenRuns("long_prompt")
+    edit_json(folder / "config.json", lambda config: config.update(tokenizer_max_length=7))
+    policy = UnifiedPolicy(folder, precision="f32")
+    assert relative(policy.infer(golden.observation(0), noise=golden.noise)["actions"], golden.actions(0)) <= 2e-5
+
+
+def test_what_the_vision_language_models_config_leaves_out_is_transformers_default() -> None:
+    """As the published SmolVLM2's does, which any user of LeRobot has in the Hub's cache."""
+    whole = PUBLISHED["HuggingFaceTB/SmolVLM2-500M-Video-Instruct"]
+    left_out = {"intermediate_size", "num_hidden_layers"}
+    part = {**whole, "vision_config": {key: one for key, one in whole["vision_config"].items() if key not in left_out}}
+    assert from_lerobot({}, completed(part)) == from_lerobot({}, whole)
+    text = {"hidden_size": 2048, "rms_norm_eps": None}
+    other = from_lerobot({}, completed({"text_config": text, "vision_config": {}}))
+    assert (other.text.num_heads, other.text.num_kv_heads, other.text.head_dim) == (32, 32, 64)
+    assert (other.text.rms_norm_eps, other.scale_factor, other.vision.patch_size) == (1e-6, 2, 32)
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        ("text_config", {"hidden_act": "gelu"}, "text_config.hidden_act = 'gelu'; Turbo-Pi computes silu alone"),
+        ("text_config", {"model_type": "gemma"}, "text_config.model_type = 'gemma'; Turbo-Pi computes llama alone"),
+        ("vision_config", {"hidden_act": "gelu"}, "vision_config.hidden_act = 'gelu'; Turbo-Pi computes gelu_pytorch"),
+        ("vision_config", {"image_size": 160, "patch_size": 4}, "of 40 patches' positions in float32 misses rows of a"),
+        ("vision_config", {"image_size": 4}, "vision image_size is 4, of patches of 8"),
+    ],
+)
+def test_another_vision_language_model_is_computed_or_refused(
+    part: str, change: dict[str, object], message: str, hub: Path, tmp_path: Path
+) -> None:
+    """LeRobot 0.6.1 runs all but the last; Turbo-Pi's actions were up to 90 % off."""
+    vlm = tmp_path / "vlm"
+    shutil.copytree(hub / "models--HuggingFaceTB--SmolVLM2-500M-Video-Instruct/snapshots" / COMMIT, vlm)
+    edit_json(vlm / "config.json", lambda config: config[part].update(change))
+    folder = make_checkpoint("base", tmp_path / "base")
+    edit_json(folder / "config.json", lambda config: config.update(resize_imgs_with_padding=[160, 160]))
+    write_json(folder / "turbopi.json", {"vlm": str(vlm)})
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("patches", "table", "element_type", "off"),
+    [
+        *((32, 32, kind, []) for kind in ("float32", "bfloat16")),  # the published model's
+        (40, 40, "float32", [19]),
+        (24, 24, "bfloat16", [5, 7, 10, 14, 17, 20, 23]),
+        (36, 27, "bfloat16", [20, 28]),
+    ],
+)
+def test_positions_are_rounded_as_in_transformers(patches: int, table: int, element_type: Any, off: list[int]) -> None:
+    """`SmolVLMVisionEmbeddings` of transformers 5.5.4 on a CPU: rows that it takes one too early or too late."""
+    rows = position_rows(patches, table, element_type)
+    assert [i for i, row in enumerate(rows) if row != i * table // patches] == off
 
 
 OLD = ("pretrained_revision", "compile_model", "compile_mode", "rtc_config", "use_peft")  # keys since 0.6, …, 0.4.3

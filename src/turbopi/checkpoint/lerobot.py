@@ -59,6 +59,7 @@ _MODES: dict[str, NormMode] = {
 }
 SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
 _EPS = 1e-8
+USE_LEROBOT = "Run this checkpoint with LeRobot's own policy"
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 _VARIANTS = ("gemma_300m", "gemma_2b")
 _CHOICES = {  # LeRobot refuses any other value of these; what counts here are the tensors' sizes and dtypes
@@ -231,7 +232,7 @@ class LeRobotFolder:
             key, meaning = refused
             raise CheckpointError(
                 f"{self.file} has {key} = {shown(self.config.values[key])}, which Turbo-Pi doesn't compute; it does "
-                f"{meaning}. Run this checkpoint with LeRobot's own policy"
+                f"{meaning}. {USE_LEROBOT}"
             )
         return family.kind
 
@@ -251,7 +252,7 @@ class LeRobotFolder:
         if family.state_token and state != action:
             raise CheckpointError(
                 f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's {family.label} has "
-                "one width for both"
+                f"one width for both. {USE_LEROBOT}"
             )
         for key, choices in _CHOICES.items():
             if self.config.values.get(key) is not None:
@@ -330,14 +331,18 @@ class LeRobotFolder:
         mode = mapping.get(kind, "IDENTITY")
         claimed = self.config.object("normalization_mapping", {}).values.get(kind, mode)
         if not isinstance(mode, str) or mode not in _MODES:
-            raise CheckpointError(f"{file} normalises {kind} by {_bare(mode)}; Turbo-Pi knows {', '.join(_MODES)}")
+            raise CheckpointError(
+                f"{file} normalises {kind} by {_bare(mode)}; Turbo-Pi knows {', '.join(_MODES)}. {USE_LEROBOT}"
+            )
         if mode != claimed:
             raise CheckpointError(
                 f"{file} normalises {kind} by {mode}, but {CONFIG} says {_bare(claimed)}. LeRobot itself follows the "
                 'processor; if that is right, correct config.json, or say {"normalization": ...} in turbopi.json'
             )
         if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
-            raise CheckpointError(f"{file} normalises images by {_bare(mapping['VISUAL'])}; expected IDENTITY")
+            raise CheckpointError(
+                f"{file} normalises images by {_bare(mapping['VISUAL'])}; expected IDENTITY. {USE_LEROBOT}"
+            )
         if step is not None and step.config.number("eps", default=_EPS) != _EPS:
             raise CheckpointError(f"{file}: {name} has eps {step.config.values['eps']}; Turbo-Pi computes with {_EPS}")
         return _MODES[mode]

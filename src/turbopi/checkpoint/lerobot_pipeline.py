@@ -212,7 +212,7 @@ class Pipelines:
                 "them. Set it to true if prompts are short enough"
             )
         # masked tokens change nothing, wherever they stand
-        step.config.choice("padding", ("max_length", "longest"), "max_length")
+        step.config.choice("padding", ("max_length", "longest", "do_not_pad"), "max_length")
         step.config.choice("padding_side", ("right", "left"), "right")
         # LeRobot's own defaults
         return step.config.integer(

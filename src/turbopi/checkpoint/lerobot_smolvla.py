@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from turbopi.checkpoint import lerobot_versions as versions
-from turbopi.checkpoint.lerobot import CONFIG, LeRobotFolder
+from turbopi.checkpoint import lerobot_vlm as vlm_config
+from turbopi.checkpoint.lerobot import CONFIG, USE_LEROBOT, LeRobotFolder
 from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
@@ -169,18 +170,23 @@ class SmolVLAFolder(LeRobotFolder):
         self.config.text("attention_mode", "cross_attn")
 
     def _network(self) -> SmolVLAConfig:
-        vlm, source = self._vlm()
+        found, source = self._vlm()
         try:
+            vlm, other = vlm_config.completed(found), vlm_config.refused(found)
             depth = _depth(self.config.values, vlm["text_config"])
-            network = from_lerobot({**self.config.values, "num_vlm_layers": depth}, {**vlm, **self._special_tokens()})
+            chosen = {"num_vlm_layers": depth, "tokenizer_max_length": self.pipelines.max_tokens}
+            network = from_lerobot({**self.config.values, **chosen}, {**vlm, **self._special_tokens()})
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
             raise CheckpointError(
                 f"{source} isn't a config of a SmolVLM: {type(error).__name__} at {error}; expected its "
                 "text_config and vision_config with their sizes"
             ) from error
-        problem = _problem(network)
-        if problem is not None:
+        if other is not None:
+            raise CheckpointError(f"{source} has {other}. {USE_LEROBOT}")
+        if (problem := _problem(network)) is not None:
             raise CheckpointError(f"{self.file} with the sizes of {source}: {problem}; LeRobot can't run it either")
+        if (other := _not_computed(network)) is not None:
+            raise CheckpointError(f"{self.file} with the sizes of {source}: {other}. {USE_LEROBOT}")
         if versions.smolvla_sums_up_time(self.config.values) and self.settings.values.get("lerobot_semantics") != "0.6":
             return SummedTimes(**{one.name: getattr(network, one.name) for one in fields(network)})
         return network
@@ -244,7 +250,7 @@ class SmolVLAFolder(LeRobotFolder):
 def _depth(config: Mapping[str, Any], text: Mapping[str, Any]) -> int:
     """Text layers that the network has: all that there are where LeRobot's number is 0 or less, never more."""
     depth: int = config.get("num_vlm_layers", 16)
-    there: int = text.get("num_hidden_layers", 32)  # a Llama's, and the published model's
+    there: int = text["num_hidden_layers"]
     return min(depth, there) if depth > 0 else there
 
 
@@ -252,16 +258,37 @@ def _problem(network: SmolVLAConfig) -> str | None:
     """What doesn't fit together, if anything."""
     vision, text = network.vision, network.text
     for name, value in (
-        *((f"vision {key}", getattr(vision, key)) for key in ("width", "depth", "mlp_dim", "num_heads", "patch_size")),
+        *(
+            (f"vision {key}", getattr(vision, key))
+            for key in ("width", "depth", "mlp_dim", "num_heads", "image_size", "patch_size")
+        ),
         *((f"text {key}", getattr(text, key)) for key in ("width", "mlp_dim", "num_heads", "num_kv_heads", "head_dim")),
     ):
         if not isinstance(value, int) or value < 1:
             return f"{name} is {shown(value)}"
+    if not vision.patch_size <= vision.image_size <= LIMITS["image_size"]:
+        return f"vision image_size is {vision.image_size}, of patches of {vision.patch_size}"
     side, factor = network.image_size // vision.patch_size, network.scale_factor
-    if side * vision.patch_size != network.image_size or side % factor:
-        return f"images of {network.image_size} pixels aren't whole patches, {factor} by {factor} of them together"
+    if side < factor or side % factor:
+        return f"{side} patches a side, of {network.image_size} pixels, aren't a multiple of {factor}"
+    if network.expert_width % 2:
+        return f"the expert is {network.expert_width} wide, and the time embedding needs an even number"
     if vision.width % vision.num_heads or text.num_heads % text.num_kv_heads or text.head_dim % 2:
         return "heads don't divide the widths"
     if network.expert_depth < 1 or text.depth % network.expert_depth:
         return f"{network.expert_depth} layers of the expert don't go into {text.depth} text layers"
+    return None
+
+
+def _not_computed(network: SmolVLAConfig) -> str | None:
+    """What LeRobot computes and Turbo-Pi doesn't, if anything."""
+    patch, size, kind = network.vision.patch_size, network.image_size, network.element_types.vision
+    patches, table = size // patch, network.vision.image_size // patch
+    if rest := size % patch:
+        return f"images of {size} pixels leave {rest} beside {patches} patches of {patch}; Turbo-Pi reads whole ones"
+    if vlm_config.position_rows(patches, table, kind) != [i * table // patches for i in range(patches)]:
+        return (
+            f"LeRobot's rounding of {patches} patches' positions in {kind} misses rows of a table of {table}, which "
+            "Turbo-Pi takes exactly"
+        )
     return None
