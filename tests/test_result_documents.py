@@ -11,7 +11,7 @@ import pytest
 import torch
 from attack.results import AttackDocument
 from kernel_turns.document import read_turns
-from load_test.document import read_load
+from load_test.document import LoadDocument
 from msgspec import Meta, Struct
 from packed import content_of, read_packed_benchmark
 
@@ -210,7 +210,8 @@ def test_checked_in_attacks_read_and_come_out_as_they_were(name: str) -> None:
 def test_checked_in_load_tests_read_and_come_out_as_they_were() -> None:
     for name in EVERY:
         if '"turbopi-load"' in (text := text_of(name))[:99]:
-            assert json.dumps(plain_document(read_load(RESULTS / name)), indent=1) + "\n" == text
+            document = as_document(json.loads(text), LoadDocument, name)
+            assert json.dumps(plain_document(document), indent=1) + "\n" == text
 
 
 def test_the_checked_in_gpu_results_read_and_come_out_as_they_were() -> None:
