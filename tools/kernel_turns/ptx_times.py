@@ -8,8 +8,8 @@ eight bits and attention of one observation (2 cameras, 48 tokens) is timed in e
 weights from memory; so are large products, whose best tile is the ceiling. bfloat16's products are the library's and
 can't be had as PTX. On Hopper mma.sync of E4M3 is emulated, so FP8's microseconds say little but beside its own
 ceiling; INT8's is the hardware's. Norms are timed with FP8's products and are the same of INT8. The denoising loop's
-floor is its weights at the speed of a large copy. At the end the ratios: what a stage's operations take in the cost
-model's tiles over what they would at the ceiling.
+floor is its weights at the speed of a large copy. The ratios are what a stage's operations take in the cost model's
+tiles over what they would at the ceiling.
 """
 
 import argparse
@@ -256,14 +256,14 @@ def main() -> int:
         (document.failed if isinstance(row, str) else document.rows).append(row)  # type: ignore[arg-type]
         print(f"failed: {row}" if isinstance(row, str) else said(row), flush=True)
         arguments.out.write_text(json.dumps(plain_document(document), indent=1) + "\n")
+    for numbers, rate in ceilings(document.rows).items():
+        over = ", ".join(f"{stage} {ratio:.2f} x" for stage, ratio in ratios(document.rows, numbers).items())
+        print(f"{numbers}: ceiling {rate / 1e6:.0f} TFLOP/s; {'of attention alone ' * (numbers == 'bf16')}{over}")
     for one in loops(target):
         document.loops.append(one)
         took = f"{one.milliseconds:.2f} ms as PTX, {one.native:.2f} native, floor {one.floor:.2f}"
         print(f"{one.numbers} denoising, H = {one.tokens}: {took}, {one.milliseconds / one.floor:.2f} x", flush=True)
         arguments.out.write_text(json.dumps(plain_document(document), indent=1) + "\n")
-    for numbers, rate in ceilings(document.rows).items():
-        over = ", ".join(f"{stage} {ratio:.2f} x" for stage, ratio in ratios(document.rows, numbers).items())
-        print(f"{numbers}: ceiling {rate / 1e6:.0f} TFLOP/s; {'of attention alone ' * (numbers == 'bf16')}{over}")
     return 1 if document.failed else 0
 
 
