@@ -20,6 +20,7 @@ from turbopi.checkpoint.lerobot_vlm import completed, position_rows
 from turbopi.checkpoint.vision_positions import shifted_rows
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
 from turbopi.preprocess.images import fit_unit, fitted
+from turbopi.realtime.messages import NOTES
 from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.support.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, TokenizerError
 
@@ -111,6 +112,12 @@ def test_a_batch_is_its_observations_one_by_one(folders: Path, hub: Path) -> Non
     for row, one in enumerate(several):
         alone = policy.infer(one, seed=1 + row)["actions"]
         assert relative(together[row]["actions"], alone) <= 1e-5
+    misspelt = several[0]
+    *_, last = (key for key in misspelt if "images" in key)
+    misspelt[f"{last}x"] = misspelt.pop(last)
+    for answer in (policy.infer(misspelt, seed=1), *policy.infer_batch([misspelt], seed=1)):
+        (note,) = (one for one in answer[NOTES] if one["kind"] == "camera_missing" and "misspelt" in one["text"])
+        assert note["names"] == [last] and f"has {last}x, which isn't read" in note["text"]
 
 
 def test_what_is_missing_is_named(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

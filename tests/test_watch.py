@@ -368,6 +368,16 @@ def test_a_camera_that_drops_out_is_named_until_it_is_back_or_a_new_episode_begi
     assert notes("top") == []
 
 
+def test_a_camera_under_a_name_that_is_not_read_is_named_while_one_is_missing() -> None:
+    watch = Watch()
+    for _ in range(2):
+        (note,) = watch.notes(Reading((0.0,), missing=("wrist",), unread=("hand",)))
+        assert (note.kind, note.names) == ("camera_missing", ("wrist",))
+        assert "has hand, which isn't read, and lacks wrist" in note.text
+    for reading in (Reading((0.0,), missing=("wrist",)), Reading((0.0,), unread=("hand",))):
+        assert watch.notes(reading) == []
+
+
 def test_exchanged_cameras_are_named_when_they_are_exchanged_after_the_start(policy: UnifiedPolicy) -> None:
     for one in moving(policy, 5):
         assert kinds(policy.infer(one, seed=0)) == []

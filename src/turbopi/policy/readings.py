@@ -86,7 +86,9 @@ class Checks:
         images = self._images(seen)
         cameras = self._known_cameras
         known = None if cameras is None else Comparison(functools.partial(cameras.notes, images))
-        return Reading(values, self.state.widths, self.state.outside(values), images=images, known=known)
+        missing, unread = seen.robot.missing, seen.robot.unread
+        outside = self.state.outside(values)
+        return Reading(values, self.state.widths, outside, images=images, missing=missing, unread=unread, known=known)
 
     def _images(self, seen: Incoming) -> dict[str, Sample]:
         labels = self._labels.get(seen.cameras)

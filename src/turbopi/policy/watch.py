@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from turbopi.realtime.messages import NOTES, Note
+from turbopi.robots.base import listed
 
 logger = logging.getLogger(__name__)
 
@@ -108,6 +109,7 @@ class Reading(NamedTuple):
     actions  the farthest value of each action that is far outside
     clipped  whether the actions were clipped
     images   by camera, under the robot's own key
+    missing, unread  of cameras, as `RobotInputs`'
     known    how they compare with known images
     """
 
@@ -117,6 +119,8 @@ class Reading(NamedTuple):
     actions: tuple[Outside, ...] = ()
     clipped: bool = False
     images: Mapping[str, Sample] = {}
+    missing: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     known: Comparison | None = None
 
 
@@ -150,6 +154,8 @@ class Watch:
             found += self._of_state(reading, at_once)
         if reading.actions:
             found.append(_of_actions(reading))
+        if reading.missing and reading.unread:
+            found.append(_of_names(reading))
         return [*found, *self._of_cameras(reading)]
 
     def to_log(self, notes: Iterable[Note]) -> list[Note]:
@@ -236,10 +242,18 @@ def listed_values(found: Sequence[Outside], verb: str = "is") -> str:
     return "; ".join(shown) + more
 
 
+def _of_names(reading: Reading) -> Note:
+    text = (
+        f"the observation has {listed(reading.unread)}, which isn't read, and lacks {listed(reading.missing)}: the "
+        "model acts without it. Is one of them misspelt?"
+    )
+    return Note("camera_missing", reading.missing, text)
+
+
 def _of_actions(reading: Reading) -> Note:
     names = tuple(one.name for one in reading.actions)
-    listed = listed_values(reading.actions, "reached" if reading.clipped else "reaches")
-    text = f"the actions are far from the checkpoint's training range: {listed}"
+    values = listed_values(reading.actions, "reached" if reading.clipped else "reaches")
+    text = f"the actions are far from the checkpoint's training range: {values}"
     if reading.clipped:
         return Note("action_clipped", names, f"{text}. They were clipped, to {FAR:g} widths of the range beyond it")
     return Note("action_range", names, text)

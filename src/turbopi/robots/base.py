@@ -26,6 +26,8 @@ class RobotInputs:
     state       float[s]       in the robot's units, before normalisation
     prompt      the task, or None if the observation has none
     in_order    whether `images` has all of the model's cameras, in its order, whatever their names
+    missing     keys of cameras that didn't come
+    unread      keys of cameras that came and aren't read: with `missing`, one may be misspelt
 
     Cameras are the model's (`base_0_rgb`, `left_wrist_0_rgb`, `right_wrist_0_rgb`; their order here doesn't matter and
     those left out are masked), or, for models trained with other names, names in the model's order.
@@ -36,6 +38,8 @@ class RobotInputs:
     state: np.ndarray
     prompt: str | None = None
     in_order: bool = False
+    missing: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
 
 class Example(dict[str, Any]):

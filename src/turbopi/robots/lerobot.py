@@ -131,8 +131,9 @@ class LeRobot(Robot):
                 f"{', '.join(map(self.sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
                 "can be left out"
             )
-        if absent:
-            _warn_once(others, [self.sent_as(key) for key in absent])
+        missing = tuple(map(self.sent_as, absent))
+        if missing:
+            _warn_once(missing)
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
         masked = [*absent, *(f"missing_{i}" for i, key in enumerate(self._spare) if key not in present)]
@@ -142,6 +143,8 @@ class LeRobot(Robot):
             read_state(require(named, STATE, self._expected), STATE, self.state_dim),
             self._prompt(observation),
             in_order=True,
+            missing=missing,
+            unread=tuple(others),
         )
 
     def _renamed(self, observation: Mapping[str, object]) -> Mapping[str, object]:
@@ -174,23 +177,13 @@ class LeRobot(Robot):
         }
 
 
-_warned: set[tuple[bool | str, ...]] = set()  # absent cameras: at most every choice of a checkpoint's, twice
+_warned: set[tuple[str, ...]] = set()  # missing cameras: at most every choice of a checkpoint's
 
 
-def _warn_once(others: list[str], absent: list[str]) -> None:
-    """Not at every step of an episode, and whatever names a client makes up."""
-    case: tuple[bool | str, ...] = (bool(others), *absent)
-    if case in _warned:
-        return
-    _warned.add(case)
-    if others:
+def _warn_once(missing: tuple[str, ...]) -> None:
+    """Not at every step of an episode."""
+    if missing not in _warned:
+        _warned.add(missing)
         logger.warning(
-            "the observation has %s, which this checkpoint doesn't read, and lacks %s, which is masked, as in LeRobot. "
-            "Is one of them misspelt?",
-            listed(others),
-            listed(absent),
-        )
-    else:
-        logger.warning(
-            "the observation lacks %s, which is masked, as in LeRobot: the model acts without it", listed(absent)
+            "the observation lacks %s, which is masked, as in LeRobot: the model acts without it", listed(missing)
         )
