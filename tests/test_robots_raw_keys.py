@@ -104,7 +104,8 @@ def test_a_renamed_camera_is_sent_by_its_own_name() -> None:
 def test_a_camera_that_the_robot_lacks_is_masked_and_said(caplog: pytest.LogCaptureFixture) -> None:
     inputs = robot().inputs(observation(wrist=None, wirst=observation()["wrist"]))
     assert inputs.image_mask == {"observation.images.front": True, "observation.images.wrist": False}
-    assert "wirst" in caplog.text and "observation.images.wrist, which is masked" in caplog.text
+    assert (inputs.missing, inputs.unread) == (("observation.images.wrist",), ("observation.images.wirst",))
+    assert "observation.images.wrist, which is masked" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ class RawKeys(Robot):
 
     def _images(self, observation: Mapping[str, object]) -> dict[str, object]:
         """The images under the checkpoint's keys. Without `cameras` in the description, images of other names are
-        handed on, too: `LeRobot` names them in its warning where a camera is missing.
+        handed on, too: they are `unread`.
         """
         if self.described.cameras is not None:
             return {sent: require(observation, raw, self._expected) for raw, sent in self.cameras.items()}
