@@ -72,12 +72,12 @@ def test_the_policy_behind_a_control_is_warmed_up() -> None:
     assert source.requested == [(4, "rtc")]
 
 
-def test_the_pictures_of_one_task_alone_are_gray() -> None:
+def test_the_images_of_one_task_alone_are_gray() -> None:
     source = Recorder()
     controlled = Controlled(source, "pictures", TASKS[:1] * 5, KEYS)
     controlled.infer([observation(0, 1), observation(0, 2)], [0, 1])
     assert {int(value) for given in source.requested for value in np.unique(given[KEYS[0]])} == {128}
-    assert "gray pictures" in controlled.label
+    assert "gray images" in controlled.label
 
 
 def test_an_unknown_prompt_passes_as_it_is() -> None:

@@ -16,8 +16,8 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.captured import CapturedBackend
 from turbopi.backends.fused_smolvla import FusedSmolVLABackend
 from turbopi.checkpoint import open_checkpoint
-from turbopi.checkpoint.lerobot_vlm import completed, position_rows
-from turbopi.checkpoint.vision_positions import shifted_rows
+from turbopi.checkpoint.lerobot_vlm import completed
+from turbopi.checkpoint.vision_positions import position_rows, shifted_rows
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
 from turbopi.preprocess.images import fit_unit, fitted
 from turbopi.realtime.messages import NOTES

@@ -17,7 +17,7 @@ from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
 from turbopi.checkpoint.source import WeightSource
-from turbopi.checkpoint.vision_positions import SHIFTED, ShiftedPositions
+from turbopi.checkpoint.vision_positions import SHIFTED, ShiftedPositions, position_rows
 from turbopi.config import LIMITS, Network, Normalization, PolicyConfig, TimeRounding
 from turbopi.models import Family
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
@@ -286,7 +286,7 @@ def _not_computed(network: SmolVLAConfig) -> str | None:
     patches, table = size // patch, network.vision.image_size // patch
     if rest := size % patch:
         return f"images of {size} pixels leave {rest} beside {patches} patches of {patch}; Turbo-Pi reads whole ones"
-    if vlm_config.position_rows(patches, table, kind) != [i * table // patches for i in range(patches)]:
+    if position_rows(patches, table, kind) != [i * table // patches for i in range(patches)]:
         return (
             f"LeRobot's rounding of {patches} patches' positions in {kind} misses rows of a table of {table}, which "
             "Turbo-Pi takes exactly"

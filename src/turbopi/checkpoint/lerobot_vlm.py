@@ -7,9 +7,6 @@ Source: `SmolVLMConfig`, `SmolVLMVisionConfig`, `LlamaConfig` and their Idefics3
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
-from turbopi.models.smolvla.config import ElementType
 from turbopi.support.reading import shown
 
 TEXT, VISION = "text_config", "vision_config"
@@ -58,14 +55,3 @@ def refused(config: Mapping[str, Any]) -> str | None:
                 name = f"{part}.{key}" if part else key
                 return f"{name} = {shown(values[key])}; Turbo-Pi computes {' or '.join(map(str, known))} alone"
     return None
-
-
-def position_rows(patches: int, table: int, element_type: ElementType) -> list[int]:
-    """For each of an image's rows of patches, the row of the position table that transformers' rounding takes.
-
-    floor(i * table / patches), but where that is whole and a quotient isn't: one row before or behind it.
-    """
-    at = (torch.arange(patches, dtype=torch.float32) * (1.0 / torch.tensor(patches))).clamp(max=1 - 1e-6)
-    begins = torch.arange(1 / table, 1.0, 1 / table)
-    rows: list[int] = torch.bucketize(at.to(getattr(torch, element_type)), begins, right=True).tolist()
-    return rows

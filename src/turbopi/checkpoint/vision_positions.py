@@ -1,4 +1,4 @@
-"""SmolVLA's image positions as transformers 4.55 to 4.57 took them in float32: one row and one column too early.
+"""SmolVLA's image positions as transformers takes them; 4.55 to 4.57, in float32: one row and one column too early.
 
 A patch of row i among n has row floor(i · S / n) of a table of S rows. Those versions multiplied i / n by 1 − 1e-6
 first and counted the rows that begin below: ceil(i · S / n) − 1, but 0 for the first. In bfloat16 the factor rounds to
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from turbopi.checkpoint.source import Piece, WeightSource
+from turbopi.models.smolvla.config import ElementType
 from turbopi.support.errors import ConfigError
 
 EXACT, SHIFTED = "exact", "shifted"
@@ -51,4 +52,15 @@ def shifted_rows(table: int, patches: int) -> torch.Tensor:
     rows = torch.arange(table)
     for i in range(patches):
         rows[i * table // patches] = max(-(-i * table // patches) - 1, 0)
+    return rows
+
+
+def position_rows(patches: int, table: int, element_type: ElementType) -> list[int]:
+    """For each of an image's rows of patches, the row of the position table that transformers' rounding takes today.
+
+    floor(i * table / patches), but where that is whole and a quotient isn't: one row before or behind it.
+    """
+    at = (torch.arange(patches, dtype=torch.float32) * (1.0 / torch.tensor(patches))).clamp(max=1 - 1e-6)
+    begins = torch.arange(1 / table, 1.0, 1 / table)
+    rows: list[int] = torch.bucketize(at.to(getattr(torch, element_type)), begins, right=True).tolist()
     return rows

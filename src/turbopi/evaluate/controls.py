@@ -30,7 +30,7 @@ class Controlled:
     pictures   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
                which episodes run side by side, so with several workers a run doesn't repeat exactly.
 
-    instructions   of the tasks that are evaluated, in order. Of one alone the pictures are always gray; raises
+    instructions   of the tasks that are evaluated, in order. Of one alone the images are always gray; raises
                    ConfigError for its prompt.
     """
 
@@ -48,7 +48,7 @@ class Controlled:
         self._source, self._control, self._image_keys = source, control, tuple(image_keys)
         self._seen: dict[str, dict[str, np.ndarray]] = {}
         self.max_batch, self.real_time = source.max_batch, source.real_time
-        self.label = f"{source.label}, {'gray pictures' if alone else f'{control} of another task'}"
+        self.label = f"{source.label}, {'gray images' if alone else f'{control} of another task'}"
         self.identity = source.identity | {"control": control}
         self.about = source.about | {"control": control}
 
