@@ -287,16 +287,20 @@ def test_lerobot_runs_with_a_camera_too_many_and_one_too_few_and_warns_once(capl
     assert (inputs.missing, inputs.unread) == (("observation.images.warned_about",), ("observation.images.topp",))
 
 
-def test_a_camera_that_lerobots_observation_lacks_is_warned_of_once(caplog: pytest.LogCaptureFixture) -> None:
-    robot = create_robot("lerobot", {**LEROBOT, "image_keys": ["observation.images.unplugged", LEROBOT_WRIST]})
-    observation = robot.example(np.random.default_rng(0))
-    robot.inputs(observation)
-    assert not caplog.records
-    del observation["observation.images.unplugged"]
-    for _ in range(3):
+def test_a_camera_that_lerobots_observation_lacks_is_warned_of_once_by_each_robot(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    for _ in range(2):  # two policies of one process
+        caplog.clear()
+        robot = create_robot("lerobot", {**LEROBOT, "image_keys": ["observation.images.unplugged", LEROBOT_WRIST]})
+        observation = robot.example(np.random.default_rng(0))
         robot.inputs(observation)
-    (record,) = caplog.records
-    assert "the observation lacks observation.images.unplugged, which is masked" in record.message
+        assert not caplog.records
+        del observation["observation.images.unplugged"]
+        for _ in range(3):
+            robot.inputs(observation)
+        (record,) = caplog.records
+        assert "the observation lacks observation.images.unplugged, which is masked" in record.message
 
 
 def test_an_observation_without_any_of_lerobots_cameras_is_refused() -> None:

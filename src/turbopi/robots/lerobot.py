@@ -110,6 +110,11 @@ class LeRobot(Robot):
         return tuple(f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras))
 
     @cached_property
+    def _warned(self) -> set[tuple[str, ...]]:
+        """Missing cameras that the log has said: at most every choice of the checkpoint's."""
+        return set()
+
+    @cached_property
     def _cameras(self) -> tuple[str, ...]:
         """All keys that images are read from."""
         return (*self.image_keys, *self._spare)
@@ -132,8 +137,11 @@ class LeRobot(Robot):
                 "can be left out"
             )
         missing = tuple(map(self.sent_as, absent))
-        if missing:
-            _warn_once(missing)
+        if missing and missing not in self._warned:  # not at every step of an episode
+            self._warned.add(missing)
+            logger.warning(
+                "the observation lacks %s, which is masked, as in LeRobot: the model acts without it", listed(missing)
+            )
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
         masked = [*absent, *(f"missing_{i}" for i, key in enumerate(self._spare) if key not in present)]
@@ -175,15 +183,3 @@ class LeRobot(Robot):
             self.sent_as(STATE): state,
             TASK: "pick up the black bowl and place it on the plate",
         }
-
-
-_warned: set[tuple[str, ...]] = set()  # missing cameras: at most every choice of a checkpoint's
-
-
-def _warn_once(missing: tuple[str, ...]) -> None:
-    """Not at every step of an episode."""
-    if missing not in _warned:
-        _warned.add(missing)
-        logger.warning(
-            "the observation lacks %s, which is masked, as in LeRobot: the model acts without it", listed(missing)
-        )
