@@ -541,6 +541,24 @@ def test_after_a_jump_of_the_clock_observations_are_used_again(jump: float) -> N
     assert fresh >= 36 and executor.report()["clock_jumps"] == 1
 
 
+@pytest.mark.parametrize("event", ["reset", "clock jump"])
+def test_an_observation_from_before_a_reset_or_a_jump_of_the_clock_waits_for_a_newer_one(event: str) -> None:
+    loop, _ = started("async", execution_horizon=4)
+    loop.run(6, delay=0)
+    executor, clock, taken, place = loop.executor, loop.clock, loop.clock.now - 2.5 / HZ, loop.place - 2
+    if event == "reset":
+        executor.reset()
+    else:
+        clock.now += 0.7
+        loop.step(observe=False)
+    # It is young enough. Its chunk would be entered at row 0, and carry out again what came after it.
+    assert not executor.observe({"place": place}, taken_at=taken) and not loop.hand.waiting
+    assert executor.report()["observations"]["before it began anew"] == 1
+    assert executor.observe({"place": loop.place}, taken_at=clock.now)
+    loop.step(observe=False, answer=True)  # `Loop` checks the place
+    assert kinds(loop)[-1] == "f"
+
+
 def test_a_new_episode_drops_the_old_ones_chunks() -> None:
     loop, _ = started("rtc", execution_horizon=4)
     loop.run(4, delay=0)

@@ -1,6 +1,7 @@
 """The executor: observations in from any thread, one command out in every control step, the policy beside it."""
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -129,6 +130,7 @@ class RealTimeExecutor:
         self._broken: ConfigError | None = None  # found by a warm-up that nobody waited for
         self._closed = False
         self._fresh_at: deque[float] = deque(maxlen=1024)  # when actions were given out
+        self._anew_at = -math.inf  # when all actions were dropped last: of what was there before, nothing is known
         self._called_at: float | None = None  # the last call of next_action
         self._empty_at: float | None = None  # the first control step without an action since the last one with one
         self._held_since: float | None = None  # if the log has said that the robot holds
@@ -221,7 +223,8 @@ class RealTimeExecutor:
         It is used if one is wanted just now: then the policy begins with it, so don't change it any more. `taken_at`,
         on the executor's clock (time.monotonic), is when it was taken; None: now. Observations older than
         `max_observation_age_s` are refused and counted; so are those from the future. One that was taken before the
-        running chunk took over isn't used, as it shows nothing of it.
+        running chunk took over isn't used, as it shows nothing of it; nor is one from before the last `reset`, or the
+        last jump of the clock.
         """
         with self._lock:
             self._check_usable()
@@ -238,6 +241,9 @@ class RealTimeExecutor:
                 return False
             if not self._queue.wants_observation or self._pending is not None:
                 seen["not wanted yet"] += 1
+                return False
+            if taken_at is not None and taken_at < self._anew_at:
+                seen["before it began anew"] += 1
                 return False
             ago = 0 if taken_at is None else sum(moment > taken_at for moment in self._fresh_at)
             if ago > self._queue.oldest_useful:
@@ -275,8 +281,7 @@ class RealTimeExecutor:
             self._queue.reset()
             self._called_at = self._empty_at = self._held_since = None
             self._stretched = False
-            self._anew = True
-            self._fresh_at.clear()
+            self._begin_anew(self._clock())
 
     @property
     def wants_observation(self) -> bool:
@@ -381,9 +386,14 @@ class RealTimeExecutor:
         if before is not None and not 0 <= now - before <= self._max_pause:
             self._journal.clock_jumps += 1
             self._queue.interrupt("clock_jump")
-            self._anew, self._empty_at = True, None
-            self._fresh_at.clear()  # moments of the clock before
+            self._empty_at = None
+            self._begin_anew(now)
             logger.warning("%.3f s between two control steps: the actions that were left are dropped", now - before)
+
+    def _begin_anew(self, now: float) -> None:
+        """Observations from before show another episode, or a robot that has moved since: how far, nobody knows."""
+        self._anew, self._anew_at = True, now
+        self._fresh_at.clear()  # after a jump they are moments of the clock before
 
     def _take_answer(self, now: float) -> None:
         """Hand the policy's answer to the queue, if it is there."""
