@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import os
+import select
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 
 from turbopi.evaluate.sources import RemotePolicy
+from turbopi.realtime import policy_socket
 from turbopi.realtime.client import RealTimeClient, ServerLost, ServerRefused
 from turbopi.realtime.frames import binary_head, binary_message
 from turbopi.realtime.policy_socket import _Awake
@@ -387,6 +389,37 @@ def test_what_another_server_answers_gets_through_as_a_chunk_of_finite_numbers_a
             with pytest.raises(ActionError):
                 client.infer({})
         assert client.infer({})["actions"].shape == (4, 7)  # on the same connection
+
+
+@pytest.mark.parametrize("idle", [False, True])
+def test_an_answer_that_nobody_asked_for_is_not_the_next_calls(idle: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    came = threading.Event()
+    monkeypatch.setattr(policy_socket, "IDLE_S", policy_socket.IDLE_S if idle else 1e6)
+
+    def handle(connection: Any) -> None:
+        with suppress(ConnectionClosed):
+            connection.send(pack({}))
+            place = unpack(connection.recv())["place"]
+            connection.send(pack({"actions": [[place]]}))
+            connection.send(pack({"actions": [[-place]]}))
+            connection.ping().wait()  # the client has read on
+            came.set()
+            connection.recv()
+
+    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
+                assert client.infer({"place": 1.0})["actions"] == 1
+                assert client._socket is not None
+                assert came.wait(60) if idle else select.select([client._socket.socket], [], [], 60)[0]
+                with pytest.raises(ServerLost, match="an answer that nobody asked for"):
+                    client.infer({"place": 2.0})
+                assert client.infer({"place": 3.0})["actions"] == 3
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def test_the_chunks_of_a_batch_message_are_each_checked() -> None:

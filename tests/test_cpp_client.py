@@ -154,6 +154,49 @@ def test_no_answer_breaks_it(program: Path) -> None:
     assert sum(line.startswith("lost ") for line in lines) > 200
 
 
+def says(*answers: bytes) -> Iterator[int]:
+    """The port of a server that gives each call one of these answers: any frames."""
+
+    def answer() -> None:
+        connection, _ = listener.accept()
+        with connection, connection.makefile("rb") as reader, suppress(ConnectionError):
+            connection.recv(65536)
+            connection.sendall(b"HTTP/1.1 101 Ok\r\nAccept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n\r\n\x82\x01\x80")
+            for frames in answers:
+                while (head := reader.read(2))[0] & 15 > 2:  # a pong
+                    reader.read(4 + (head[1] & 127))
+                reader.read(4 + int.from_bytes(reader.read(8), "big"))
+                connection.sendall(frames)
+            connection.recv(65536)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        answering = threading.Thread(target=answer)
+        answering.start()
+        yield listener.getsockname()[1]
+        answering.join()
+
+
+def frame(message: bytes, kind: int = 0x82) -> bytes:
+    return bytes([kind, 127]) + len(message).to_bytes(8, "big") + message
+
+
+def test_an_answer_that_nobody_asked_for_is_not_the_next_calls(program: Path) -> None:
+    once, again = (frame(pack({"actions": np.full((2, 3), value)})) for value in (1.0, 2.0))
+    for port in says(once + frame(b"ping", 0x89), once + again):
+        lines = run(program, port, "", 60, 3, "go on")
+    assert lines[:2] == ["actions 2 3 1"] * 2 and lines[2].endswith("an answer that nobody asked for")
+
+
+def test_no_answer_costs_more_than_its_bytes_or_has_numbers_that_no_robot_may_get(program: Path) -> None:
+    far = np.ones((2, 3))
+    far[1, 2] = 1e39
+    for port in says(frame(pack({"actions": far})), frame(b"\xdd\x00\x10\x00\x00" + bytes(2**20))):
+        lines = run(program, port, "", 60, 2, "go on")
+    assert lines[0] == "lost actions aren't finite in float" and lines[1].endswith(
+        "more than 20000 values in one message"
+    )
+
+
 def test_no_frame_breaks_it(program: Path) -> None:
     """After a right greeting, bytes that may be frames of any kind and length; then the connection's end."""
     draw = random.Random(0)

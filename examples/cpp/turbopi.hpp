@@ -25,6 +25,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <map>
 #include <random>
 #include <stdexcept>
@@ -155,8 +156,10 @@ class Reader {
   }
 
  private:
+  static constexpr size_t kMostValues = 20000;  // each takes about 100 bytes, and may come as one
+
   const std::string& data_;
-  size_t at_ = 0;
+  size_t at_ = 0, values_ = 0;
 
   std::string bytes(size_t count) {
     if (count > data_.size() - at_) throw Lost("the message is cut off");
@@ -204,6 +207,7 @@ class Reader {
 
   Value read(int depth) {
     if (depth > 32) throw Lost("more than 32 maps and lists inside each other");
+    if (++values_ > kMostValues) throw Lost("more than 20000 values in one message");
     const unsigned head = static_cast<unsigned>(number(1));
     if (head < 0x80) return int64_t{head};
     if (head < 0x90) return map(head & 15, depth);
@@ -245,7 +249,7 @@ class Reader {
 
 }  // namespace wire
 
-// One chunk: H actions of d numbers each, all finite.
+// One chunk: H actions of d numbers each, all finite in float.
 struct Chunk {
   size_t rows = 0, columns = 0;
   std::vector<double> values;
@@ -265,7 +269,7 @@ inline Chunk actions(const Map& result) {
     chunk.values = array.as<double>();
   }
   for (double one : chunk.values) {
-    if (!std::isfinite(one)) throw Lost("actions aren't finite");
+    if (!(std::abs(one) <= std::numeric_limits<float>::max())) throw Lost("actions aren't finite in float");
   }
   return chunk;
 }
@@ -315,6 +319,7 @@ class Client {
   Map infer(const Map& observation) {
     begin();
     if (socket_ < 0) connect();
+    catch_up();
     std::string message;
     wire::pack(message, Value(observation));
     send_frame(2, message);
@@ -354,12 +359,17 @@ class Client {
     throw Lost(host_ + ":" + std::to_string(port_) + ": " + why);
   }
 
-  void wait(short what) {
+  // Milliseconds until the call gives up, from 0.
+  int left() const {
     using std::chrono::milliseconds;
     const auto left = std::chrono::duration_cast<milliseconds>(end_ - std::chrono::steady_clock::now()).count();
+    return static_cast<int>(std::clamp<int64_t>(left, 0, 1 << 30));
+  }
+
+  void wait(short what) {
     pollfd one{socket_, what, 0};
-    const int most = static_cast<int>(std::min<int64_t>(left, 1 << 30));
-    if (left <= 0 || ::poll(&one, 1, most) == 0) lose("no answer in time");
+    const int most = left();
+    if (most == 0 || ::poll(&one, 1, most) == 0) lose("no answer in time");
   }
 
   void connect() {
@@ -375,8 +385,7 @@ class Client {
       if (error == EINPROGRESS) {
         pollfd writable{socket_, POLLOUT, 0};
         socklen_t size = sizeof error;
-        const int ready = ::poll(&writable, 1, static_cast<int>(std::min(answer_s_ * 1000, 1e9)));
-        if (ready <= 0) error = ETIMEDOUT;
+        if (::poll(&writable, 1, left()) <= 0) error = ETIMEDOUT;
         else ::getsockopt(socket_, SOL_SOCKET, SO_ERROR, &error, &size);
       }
       if (error != 0) drop();
@@ -448,28 +457,49 @@ class Client {
     return taken;
   }
 
+  struct Frame {
+    int opcode;
+    bool last;
+    std::string data;
+  };
+
+  // One frame of at most `most` bytes. Pings are answered.
+  Frame frame(size_t most) {
+    if (left() == 0) lose("no answer in time");  // also if pings come without end
+    const std::string head = take(2);
+    if (head[1] & 0x80) lose("a masked frame");
+    uint64_t size = head[1] & 0x7f;
+    if (size > 125) {
+      uint64_t longer = 0;
+      for (unsigned char byte : take(size == 126 ? 2 : 8)) longer = longer << 8 | byte;
+      size = longer;
+    }
+    if (size > most) lose("an answer of more than 64 MB");
+    Frame found{head[0] & 15, (head[0] & 0x80) != 0, take(static_cast<size_t>(size))};
+    const std::string& data = found.data;
+    if (found.opcode == 8) lose("the server closed the connection" + (data.size() > 2 ? ": " + data.substr(2) : ""));
+    if (found.opcode == 9) send_frame(10, data);
+    return found;
+  }
+
+  // What came since the last answer. Another answer would be taken for the next call's, and each later one, too.
+  void catch_up() {
+    pollfd one{socket_, POLLIN, 0};
+    while (!received_.empty() || ::poll(&one, 1, 0) > 0) {
+      if (frame(kMost).opcode < 8) lose("an answer that nobody asked for");
+    }
+  }
+
   // One message; frames may be parts of it, or pings between them.
   Map receive() {
     std::string message;
     int kind = 0;
     for (bool whole = false; !whole;) {
-      const std::string head = take(2);
-      const int opcode = head[0] & 15;
-      if (head[1] & 0x80) lose("a masked frame");
-      uint64_t size = head[1] & 0x7f;
-      if (size > 125) {
-        uint64_t longer = 0;
-        for (unsigned char byte : take(size == 126 ? 2 : 8)) longer = longer << 8 | byte;
-        size = longer;
-      }
-      if (size > kMost - message.size()) lose("an answer of more than 64 MB");
-      std::string data = take(static_cast<size_t>(size));
-      if (opcode == 8) lose("the server closed the connection" + (data.size() > 2 ? ": " + data.substr(2) : ""));
-      if (opcode == 9) send_frame(10, data);
-      if (opcode >= 8) continue;
-      if (opcode != 0) kind = opcode;
-      message += data;
-      whole = (head[0] & 0x80) != 0;
+      const Frame next = frame(kMost - message.size());
+      if (next.opcode >= 8) continue;
+      if (next.opcode != 0) kind = next.opcode;
+      message += next.data;
+      whole = next.last;
     }
     if (kind == 1) throw Refused(message);
     try {

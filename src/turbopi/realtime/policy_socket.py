@@ -87,6 +87,7 @@ class PolicySocket:
         try:
             with self._stream.using:
                 if send is not None:
+                    self._stream.catch_up()
                     send()
                 with self._awake:
                     reply = self._stream.receive()
@@ -108,6 +109,7 @@ class _Stream:
         uri = parse_uri(url)
         self.using = threading.Lock()
         self._events: deque[object] = deque()
+        self._readable = select.poll()
         self._begun = 0  # bytes of a frame whose end the library waits for
         self._protocol = ClientProtocol(uri, max_size=MAX_BYTES)
         self.socket = socket.create_connection((uri.host, uri.port), timeout=seconds)
@@ -129,6 +131,8 @@ class _Stream:
                 raise self._protocol.handshake_exc
             assert isinstance(response, Response)
             self.offer = response.headers.get(HEADER)  # of shared memory
+            if not uri.secure:  # where what is readable may be no message
+                self._readable.register(self.socket, select.POLLIN)
             self.socket.settimeout(None)
         except BaseException:
             self.socket.close()
@@ -159,6 +163,18 @@ class _Stream:
                 frames.append(event)
         data = b"".join([frame.data for frame in frames])
         return data.decode(errors="replace") if frames[0].opcode is Opcode.TEXT else data
+
+    def catch_up(self) -> None:
+        """Handle what has come since the last answer. Raises OSError for another answer, as `receive` would take it for
+        the next message's.
+        """
+        while True:
+            if any(isinstance(event, Frame) and event.opcode < Opcode.CLOSE for event in self._events):
+                raise OSError("it sent an answer that nobody asked for")
+            self._events.clear()
+            if self.ended or not self._readable.poll(0):
+                return
+            self._read()
 
     def read_on(self) -> None:
         """Handle what has come, now that the socket is readable: pings are answered."""
