@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from serve_fakes import wait_for
 
 from turbopi.serve import running
 
@@ -234,6 +235,19 @@ def test_an_image_of_another_kind_is_named_once(example: ModuleType, monkeypatch
         robot.node.chunks.close()
     said = [line for line in robot.node.logged if "16UC1" in line]
     assert len(said) == 1 and said[0].startswith("the image of /wrist/image_raw: its encoding is '16UC1'")
+
+
+def test_a_way_to_run_that_the_policy_lacks_is_named_and_leaves_no_connection(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(Policy()) as server:
+        robot = Robot(example, monkeypatch, server.port, execution="rtc")
+        for _ in range(3):  # every second
+            robot.node.connect()
+        assert (
+            len(robot.node.logged) == 1 and "execution 'rtc' needs a policy that joins chunks" in robot.node.logged[0]
+        )
+        wait_for(lambda: "turbopi_clients 0.0" in server.metrics.text())
 
 
 def test_a_node_waits_for_its_server(example: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

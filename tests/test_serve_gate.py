@@ -169,12 +169,14 @@ UPGRADE = (
 
 
 async def said(server: PolicyServer, line: str, *headers: str) -> tuple[int, bytes]:
-    """Status and answer of a request that begins with `line`; 0: it was closed without one, as websockets 16 does."""
+    """Status and answer of a request that begins with `line`. What the library can't read is a 400: so is what isn't
+    GET of HTTP/1.1, with websockets before 17.
+    """
     reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
     writer.write("\r\n".join([line, f"Host: 127.0.0.1:{server.port}", *headers, "", ""]).encode())
     answer = await asyncio.wait_for(reader.read(), 120)
     writer.close()
-    return int(answer.split()[1]) if answer else 0, answer
+    return int(answer.split()[1]), answer
 
 
 @pytest.mark.parametrize("path", ["/", "/metrics", "/healthz", "/live"])
@@ -198,12 +200,26 @@ def test_nothing_but_get_is_answered(path: str) -> None:
                 if method == "POST":
                     assert status == 404 and b"POST goes to /v1/actions alone" in answer, headers
                     continue
-                assert status in (405, 0), (method, headers)
-                assert not answer or b"\r\nAllow: GET\r\n" in answer
-                assert method != "HEAD" or not answer.partition(b"\r\n\r\n")[2]
+                assert status in (405, 400), (method, headers)
+                assert status == 400 or b"\r\nAllow: GET\r\n" in answer
+                assert status == 400 or method != "HEAD" or not answer.partition(b"\r\n\r\n")[2]
         assert (await said(server, "GET /healthz HTTP/1.1"))[0] == 200
         status, answer = await said(server, "GET /v1/actions HTTP/1.1")
         assert status == 405 and b"\r\nAllow: POST\r\n" in answer and b"POST an observation to /v1/actions" in answer
+
+    served(test)
+
+
+@pytest.mark.parametrize(
+    "line", ["PUT /v1/actions HTTP/1.1", "GET /healthz HTTP/1.1", "post /v1/actions HTTP/1.1", "hello"]
+)
+def test_what_is_no_request_for_this_server_is_told_so(line: str) -> None:
+    """The websockets library ends the connection without a word where a body comes, or a line that it can't read."""
+
+    async def test(server: PolicyServer) -> None:
+        status, answer = await said(server, line, "Content-Length: 3", "", "abc")
+        assert status == 400 and answer.endswith(b"and POST /v1/actions\n") and answer.count(b"HTTP/1.1 400") == 1
+        assert server.metrics.errors_so_far() == {"malformed": 1}
 
     served(test)
 
@@ -213,7 +229,7 @@ def test_another_version_of_http_is_refused(version: str) -> None:
     async def test(server: PolicyServer) -> None:
         for path in ("/", "/metrics", "/healthz"):
             for headers in ((), UPGRADE):
-                assert (await said(server, f"GET {path} {version}", *headers))[0] in (505, 400, 0)
+                assert (await said(server, f"GET {path} {version}", *headers))[0] in (505, 400)
 
     served(test)
 

@@ -93,15 +93,19 @@ class PolicyNode(Node):  # type: ignore[misc]
         """Until the server is there for the first time; afterwards the client connects again by itself."""
         if self.chunks is not None:
             return
+        client = None
         try:
+            client = RealTimeClient(self.server, connect_s=self.max_age, answer_s=self.max_age)
             self.chunks = RealTimeExecutor(
-                RealTimeClient(self.server, connect_s=self.max_age, answer_s=self.max_age),
+                client,
                 control_hz=1 / self.step,
                 execution=self.execution,
                 max_observation_age_s=self.max_age,
                 max_jump=self.max_jump,
             )  # without hold_action: the trajectory controller holds the last point
         except TurboPiError as error:
+            if client is not None:
+                client.close()  # it is tried again every second, and the server lets so many clients in
             self._complain(str(error))
 
     def _take_image(self, key: str, image: Image) -> None:

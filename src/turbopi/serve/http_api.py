@@ -22,6 +22,7 @@ from typing import Any, Literal
 import h11
 import msgspec
 from websockets.client import ClientProtocol
+from websockets.exceptions import InvalidMessage
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 from websockets.protocol import State
@@ -65,6 +66,9 @@ KINDS = sorted(
 )
 
 _POST = b"POST "
+_NO_REQUEST = (
+    f"no request that this server reads: it answers GET of HTTP/1.1 without a body, websockets, and POST {ACTIONS}\n"
+).encode()
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f\x7f]")
 _OWN_HEADERS = (b"connection", b"upgrade", b"expect", b"te", b"trailer", b"keep-alive", b"proxy-connection")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="turbopi-json")  # one body at a time, beside the event loops
@@ -88,6 +92,7 @@ class PortConnection(GuardedConnection):
         self._again = again
         self._post: Post | None = None
         self._first: bytes | None = b""
+        self._told = False  # why its request is none
 
     def next_one(self) -> "PortConnection":
         """The socket's next one, which this client goes on with."""
@@ -109,6 +114,16 @@ class PortConnection(GuardedConnection):
                 self._post.data_received(data)
                 return b""
         return super()._http(data)
+
+    def send_data(self) -> None:
+        fault = self.protocol.handshake_exc
+        if isinstance(fault, InvalidMessage) and self._post is None and not self._told:
+            self._told = True  # the library ends the connection without a word
+            if not isinstance(fault.__cause__, EOFError):  # who has left reads nothing
+                self._shared.metrics.error("malformed")
+                head = b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nContent-Length: %d\r\n"
+                self.transport.write(head % len(_NO_REQUEST) + b"Connection: close\r\n\r\n" + _NO_REQUEST)
+        super().send_data()
 
     async def recv(self, decode: bool | None = None) -> Any:
         message = await super().recv(decode)
