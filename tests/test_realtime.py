@@ -727,6 +727,16 @@ def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text:
         RealTimeExecutor(given.pop("policy"), **given)
 
 
+def test_a_policy_with_memory_is_warned_of_as_its_history_would_lack_observations(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    policy = Gated()
+    for metadata, warnings in (({}, 0), ({"memory": {"visual": 4}}, 1)):
+        policy.metadata = metadata
+        RealTimeExecutor(policy, control_hz=50, execution="async").close()
+        assert sum("this policy has memory" in one.message for one in caplog.records) == warnings
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -1,11 +1,14 @@
 """What the executor needs of a policy: UnifiedPolicy, RealTimeClient, or openpi's WebsocketClientPolicy."""
 
 import inspect
+import logging
 from collections.abc import Mapping
 from typing import Any
 
 from turbopi.realtime import Way
 from turbopi.support.errors import ConfigError
+
+logger = logging.getLogger(__name__)
 
 
 def metadata_of(policy: Any) -> Mapping[str, Any]:
@@ -17,10 +20,20 @@ def metadata_of(policy: Any) -> Mapping[str, Any]:
 
 
 def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
-    """What it offers for real-time execution, of its metadata. Raises ConfigError if it can't be run in this way."""
+    """What it offers for real-time execution, of its metadata. Raises ConfigError if it can't be run in this way.
+
+    Warns, in the log, of a policy with memory, whose history the executor doesn't keep.
+    """
     if not callable(getattr(policy, "infer", None)):
         raise ConfigError(f"a {type(policy).__name__} is no policy: it has no infer(observation)")
-    offered = metadata_of(policy).get("real_time")
+    told = metadata_of(policy)
+    if "memory" in told:
+        logger.warning(
+            "this policy has memory, and the executor shows it only those observations that it computes chunks from: "
+            "give those that `observe` returns False for to the policy's own `observe`, and call its `reset` after the "
+            "warm-up and with each `reset`; else its history isn't that of training"
+        )
+    offered = told.get("real_time")
     offered = offered if isinstance(offered, Mapping) else {}
     if way.mode is None:
         return offered
