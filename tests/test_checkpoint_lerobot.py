@@ -106,6 +106,26 @@ def test_empty_cameras_count_even_if_the_features_leave_them_out(tmp_path: Path)
     assert checkpoint.config.robot_options["num_missing_cameras"] == 3
 
 
+def test_an_empty_camera_that_the_features_list_first_comes_first(tmp_path: Path) -> None:
+    """A sorted config.json: LeRobot's cameras are in its order, empty ones too. "empty_camera_left" isn't one."""
+    folder = lerobot_copy(tmp_path / "c", empty_cameras=2)
+    edit_json(
+        folder / "config.json",
+        lambda content: content.update(
+            input_features=dict(sorted(content["input_features"].items()))
+            | {f"observation.images.empty_camera_{name}": {"type": "VISUAL"} for name in ("left", "5")}
+        ),
+    )
+    options = open_checkpoint(folder).config.robot_options
+    one, two, left, five, added = (
+        f"observation.images.{name}"
+        for name in ("image", "image2", "empty_camera_left", "empty_camera_5", "empty_camera_1")
+    )
+    assert options["image_keys"] == [one, two, left]
+    assert options["camera_order"] == ["observation.images.empty_camera_0", one, two, left, five, added]
+    assert options["num_missing_cameras"] == 3
+
+
 def test_turbopi_json_puts_single_differences_over_the_description(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     write_json(folder / "turbopi.json", {"robot": "libero", "action_horizon": 12})

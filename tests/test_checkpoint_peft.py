@@ -131,6 +131,13 @@ def test_a_base_that_the_adapter_names_is_found_as_lerobot_finds_it(
     assert all(torch.equal(value, expected[name]) for name, value in weights(folder).items())
 
 
+def test_a_start_that_left_the_base_alone_is_merged_like_any(folder: Path) -> None:
+    expected = weights(folder)["action_in_proj.weight"]
+    for start in (False, "gaussian", "eva", "orthogonal"):
+        edit_json(folder / CONFIG, lambda content: content.update(init_lora_weights=start))  # noqa: B023
+        assert torch.equal(weights(folder)["action_in_proj.weight"], expected), start
+
+
 def test_a_base_that_cannot_be_one_is_refused(folder: Path) -> None:
     write_json(folder / "turbopi.json", {"vision_heads": 2, "base_model": "nowhere"})
     with pytest.raises(CheckpointError, match=f"there is no folder {folder / 'nowhere'}"):

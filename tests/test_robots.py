@@ -344,6 +344,12 @@ def test_a_picture_of_an_empty_camera_is_read_as_lerobot_reads_it() -> None:
     inputs = robot.inputs(lerobot_observation() | extra)
     assert list(inputs.image_mask.values()) == [True, True, True, False]
     assert list(inputs.images)[2:] == ["observation.images.empty_camera_1", "missing_0"]
+    present = [*extra, "observation.images.top", LEROBOT_WRIST]
+    order = [*present, "observation.images.empty_camera_7"]
+    robot = create_robot("lerobot", {**LEROBOT, "num_missing_cameras": 2, "camera_order": order})
+    inputs = robot.inputs(lerobot_observation() | extra)
+    assert inputs.image_mask == dict.fromkeys(present, True) | {"missing_1": False}
+    assert list(inputs.images)[:3] == present
 
 
 def test_lerobots_task_may_be_a_list_of_one() -> None:
@@ -358,6 +364,10 @@ def test_lerobots_task_may_be_a_list_of_one() -> None:
         ({"image_keys": []}, "image_keys must be a list of different keys"),
         ({"image_keys": "observation.images.top"}, "image_keys must be a list"),
         ({"image_keys": ["a", "a"]}, "image_keys must be a list of different keys"),
+        (
+            {"camera_order": ["a", "b"]},
+            r"camera_order must be a list of 2 different keys: image_keys and .*\['a', 'b'\]",
+        ),
         ({"state_dim": 0}, "state_dim must be an integer of at least 1, got 0"),
         ({"rename_map": {"a": 1}}, "rename_map must be an object of keys and their new names, got {'a': 1}"),
         ({"rename_map": ["a"]}, "rename_map must be an object"),

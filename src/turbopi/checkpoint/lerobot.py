@@ -6,6 +6,7 @@ prompt; cameras that aren't there come last; t is 1 + step * dt. What 0.4 did ot
 the processors' steps may be in lerobot_pipeline.py.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
@@ -50,6 +51,7 @@ from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, file_inside, one_line, read_json, shown
 
 CONFIG, EMPTY_CAMERA = "config.json", "observation.images.empty_camera_"
+_EMPTY_CAMERA = re.compile(re.escape(EMPTY_CAMERA) + "[0-9]+")
 
 _MODES: dict[str, NormMode] = {
     "QUANTILES": "lerobot_quantile",
@@ -404,11 +406,12 @@ class LeRobotFolder:
                     f"{', '.join(_FEATURE_TYPES)}"
                 )
         visual = [key for key, feature in inputs.items() if feature["type"] == "VISUAL"]
-        cameras = [key for key in visual if not key.startswith(EMPTY_CAMERA)]
+        cameras = [key for key in visual if not _EMPTY_CAMERA.fullmatch(key)]
         if not cameras:
             raise CheckpointError(f"{self.file} lists no camera among its input_features")
-        empty = {key for key in visual if key.startswith(EMPTY_CAMERA)}
-        empty |= {f"{EMPTY_CAMERA}{index}" for index in range(self.config.integer("empty_cameras", 0, 64, default=0))}
+        added = (f"{EMPTY_CAMERA}{index}" for index in range(self.config.integer("empty_cameras", 0, 64, default=0)))
+        order = [*visual, *(key for key in added if key not in visual)]
+        spare = len(order) - len(cameras)
         mask = self.pipelines.relative_mask(self.action_dim)
         if mask is not None and self.state_dim < self.action_dim:
             raise CheckpointError(
@@ -417,10 +420,12 @@ class LeRobotFolder:
             )
         options: dict[str, object] = {
             "image_keys": cameras,
-            "num_missing_cameras": len(empty),
+            "num_missing_cameras": spare,
             "state_dim": self.state_dim,
             "action_dim": self.action_dim,
         }
+        if order != [*cameras, *(f"{EMPTY_CAMERA}{index}" for index in range(spare))]:
+            options["camera_order"] = order
         if self.pipelines.rename_map:
             options["rename_map"] = self.pipelines.rename_map
         if (names := self._action_names()) is not None:

@@ -43,7 +43,7 @@ _NO_MATTER = {
     *("task_type", "loftq_config"),
 }
 # init_lora_weights that set A and B alone; others (PiSSA, LoftQ, ...) change the base's weights, too
-_PLAIN_STARTS = (True, False, "gaussian", "eva")
+_PLAIN_STARTS = (True, False, "gaussian", "eva", "orthogonal")
 _REPEATS, _REPEATED_GROUP = re.compile(r"[*+?{]"), re.compile(r"\)[*+?{]")  # a hostile one matches for hours
 _ADVICE = "Merge it in LeRobot's environment (peft's merge_and_unload), save the whole policy, and give that folder"
 

@@ -45,6 +45,7 @@ class LeRobot(Robot):
                          in LeRobot, and the log warns once; cameras of other names aren't read
     num_missing_cameras  LeRobot's empty_cameras after them: masked, unless an observation has observation.images.empty_
                          camera_0, ...
+    camera_order         all of these keys, in the checkpoint's order, where that is another
     rename_map           observations' keys -> the checkpoint's; where an observation has both, the later one is read
     relative_dims        per action, whether the model's is relative to the state
     action_names         the recording robot's key of each action, where the checkpoint has them
@@ -57,6 +58,7 @@ class LeRobot(Robot):
     rename_map: Mapping[str, str] | None = None
     relative_dims: Sequence[bool] | None = None
     action_names: Sequence[str] | None = None
+    camera_order: Sequence[str] | None = None
 
     name = "lerobot"
 
@@ -79,6 +81,17 @@ class LeRobot(Robot):
             raise ConfigError(
                 f"relative_dims has {len(relative)} dimensions, but there are {self.action_dim} of actions and "
                 f"{self.state_dim} of the state"
+            )
+        order, count = self.camera_order, len(self.image_keys) + self.num_missing_cameras
+        if order is not None and not (
+            isinstance(order, list | tuple)
+            and all(isinstance(key, str) for key in order)
+            and len({*order}) == len(order) == count
+            and {*order} >= {*self.image_keys}
+        ):
+            raise ConfigError(
+                f"camera_order must be a list of {count} different keys: image_keys and num_missing_cameras = "
+                f"{self.num_missing_cameras} more, got {order!r}"
             )
         names = self.action_names
         if names is not None and not (
@@ -105,19 +118,16 @@ class LeRobot(Robot):
         return tuple(range(1, len(self.image_keys) + 1))
 
     @cached_property
-    def _spare(self) -> tuple[str, ...]:
-        """The keys of LeRobot's empty cameras."""
-        return tuple(f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras))
-
-    @cached_property
     def _warned(self) -> set[tuple[str, ...]]:
         """Missing cameras that the log has said: at most every choice of the checkpoint's."""
         return set()
 
     @cached_property
-    def _cameras(self) -> tuple[str, ...]:
-        """All keys that images are read from."""
-        return (*self.image_keys, *self._spare)
+    def _cameras(self) -> Sequence[str]:
+        """All keys that images are read from: of the checkpoint's cameras, and of LeRobot's empty ones."""
+        if self.camera_order is not None:
+            return self.camera_order
+        return (*self.image_keys, *(f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras)))
 
     @cached_property
     def _expected(self) -> tuple[str, ...]:
@@ -144,7 +154,8 @@ class LeRobot(Robot):
             )
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
-        masked = [*absent, *(f"missing_{i}" for i, key in enumerate(self._spare) if key not in present)]
+        spare = (key for key in self._cameras if key not in self.image_keys)
+        masked = [*absent, *(f"missing_{i}" for i, key in enumerate(spare) if key not in present)]
         return RobotInputs(
             images | dict.fromkeys(masked, black),
             dict.fromkeys(present, True) | dict.fromkeys(masked, False),
