@@ -213,7 +213,7 @@ def test_nothing_but_get_is_answered(path: str) -> None:
 @pytest.mark.parametrize(
     "line", ["PUT /v1/actions HTTP/1.1", "GET /healthz HTTP/1.1", "post /v1/actions HTTP/1.1", "hello"]
 )
-def test_what_is_no_request_for_this_server_is_told_so(line: str) -> None:
+def test_what_is_no_request_for_this_server_gets_a_400(line: str) -> None:
     """The websockets library ends the connection without a word where a body comes, or a line that it can't read."""
 
     async def test(server: PolicyServer) -> None:

@@ -26,14 +26,14 @@ def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
     """
     if not callable(getattr(policy, "infer", None)):
         raise ConfigError(f"a {type(policy).__name__} is no policy: it has no infer(observation)")
-    told = metadata_of(policy)
-    if "memory" in told:
+    metadata = metadata_of(policy)
+    if "memory" in metadata:
         logger.warning(
             "this policy has memory, and the executor shows it only those observations that it computes chunks from: "
             "give those that `observe` returns False for to the policy's own `observe`, and call its `reset` after the "
             "warm-up and with each `reset`; else its history isn't that of training"
         )
-    offered = told.get("real_time")
+    offered = metadata.get("real_time")
     offered = offered if isinstance(offered, Mapping) else {}
     if way.mode is None:
         return offered

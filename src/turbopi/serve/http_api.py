@@ -92,7 +92,7 @@ class PortConnection(GuardedConnection):
         self._again = again
         self._post: Post | None = None
         self._first: bytes | None = b""
-        self._told = False  # why its request is none
+        self._refused = False  # why its request is none
 
     def next_one(self) -> "PortConnection":
         """The socket's next one, which this client goes on with."""
@@ -117,8 +117,8 @@ class PortConnection(GuardedConnection):
 
     def send_data(self) -> None:
         fault = self.protocol.handshake_exc
-        if isinstance(fault, InvalidMessage) and self._post is None and not self._told:
-            self._told = True  # the library ends the connection without a word
+        if isinstance(fault, InvalidMessage) and self._post is None and not self._refused:
+            self._refused = True  # the library ends the connection without a word
             if not isinstance(fault.__cause__, EOFError):  # who has left reads nothing
                 self._shared.metrics.error("malformed")
                 head = b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nContent-Length: %d\r\n"
