@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import smolvla_golden
 from checkpoint_helpers import GOLDEN, torch_copy
 from cli_helpers import refusal, text_of, turbopi
 from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
+from turbopi.cli import checkpoints
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 
 ARM = {
@@ -289,3 +291,12 @@ def test_the_frames_statistics_are_openpis_format() -> None:
     content = json.loads((FRAMES / "norm_stats.json").read_text())
     assert set(content["norm_stats"]) == {"state", "actions"}
     assert random_checkpoint("pi05_tiny").norm_stats.state is not None
+
+
+def test_a_smolvla_without_its_library_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(smolvla_golden.make_hub(tmp_path / "hub")))
+    folder = smolvla_golden.make_checkpoint("special_tokens", tmp_path / "smolvla")
+    for there in (True, False):
+        monkeypatch.setattr(checkpoints, "find_spec", lambda name, there=there: there or None)
+        shown = " ".join(text_of(turbopi("inspect", folder).stdout).replace("│", " ").split())
+        assert ("needs the library tokenizers, which isn't installed" in shown) == (not there)

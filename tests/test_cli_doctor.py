@@ -7,9 +7,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import pi0_fast_golden
 import pytest
 import torch
-from cli_helpers import refusal, turbopi
+from cli_helpers import refusal, text_of, turbopi
 
 from turbopi import backends
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
@@ -93,6 +94,28 @@ def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
     code, rows = doctor("--checkpoint", folder, "--tokenizer", TINY_TOKENIZER)
     assert code == 0
     assert rows["tokenizer"]["found"] == str(TINY_TOKENIZER)
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_of_a_model_that_writes_tokens_the_action_tokenizer_and_its_backends_are_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    folder = pi0_fast_golden.make_folder("base", tmp_path / "fast")
+    code, rows = doctor(folder, "--tokenizer", pi0_fast_golden.TOKENIZER)
+    assert code == 1 and rows["action tokenizer"]["level"] == "FAIL"
+    assert rows["action tokenizer"]["fix"].startswith("`hf download lerobot/fast-action-tokenizer`; or ")
+    assert "62,784 parameters" in rows["checkpoint"]["found"]
+    shown = text_of(turbopi("inspect", folder).stdout).replace("│", " ")
+    assert "which isn't here: `turbopi doctor" in " ".join(shown.split()) and "action expert" not in shown
+
+    pi0_fast_golden.make_hub(tmp_path / "hub")
+    result = turbopi("doctor", folder, "--tokenizer", pi0_fast_golden.TOKENIZER, "--device", "cpu", "--json")
+    document = json.loads(result.stdout)
+    assert result.exit_code == 0
+    reasons = {one["name"]: one["reason"] for one in document["backends"]}
+    assert reasons["pytorch"] is None and "has no plan for Pi0-FAST" in reasons["pytorch_compile"]
+    assert "Pi0 and Pi0.5 alone" in reasons["emulated_fp8"]
 
 
 def test_a_checkpoint_is_given_as_to_other_commands_or_as_an_option(tmp_path: Path) -> None:

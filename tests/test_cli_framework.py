@@ -266,6 +266,15 @@ def test_tables_fit_a_narrow_dumb_terminal(monkeypatch: pytest.MonkeyPatch) -> N
     assert Output().console.width == 60
 
 
+@pytest.mark.parametrize("columns", [60, 100])
+def test_help_is_as_wide_as_a_dumb_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
+    described = turbopi("bench", "--help").stdout.split("Examples")[0]
+    assert columns - 12 < max(map(len, described.splitlines())) <= columns
+
+
 @pytest.mark.parametrize(("option", "value"), [("--port", "80x"), ("--port", "99999"), ("--max-batch", "-1")])
 def test_a_wrong_value_is_named(option: str, value: str) -> None:
     ran = turbopi("serve", option, value)

@@ -145,7 +145,7 @@ def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: P
 def test_actions_replace_earlier_ones_with_a_note_and_no_other_file(npz: Path, tmp_path: Path) -> None:
     assert "replaced" not in infer(tmp_path, npz, "--no-plot").output
     again = infer(tmp_path, npz, "--no-plot")
-    assert f"note: {tmp_path}/actions.npz is there, and is replaced; --out names another file" in again.output
+    assert f"note: {tmp_path}/actions.npz is there, and will be replaced; --out names another file" in again.output
     mine = tmp_path / "mine.npz"
     np.savez(mine, actions=np.zeros(3))
     refused = refusal(turbopi("infer", *TINY, npz, "-o", mine))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from email.message import Message
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from turbopi.support import installation
-from turbopi.support.installation import install_command
+from turbopi.support.installation import install_command, manual
 
 ROOT = Path(__file__).parents[1]
 
@@ -83,3 +84,14 @@ def test_pip_is_the_one_of_this_python(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_document_names_a_package_that_no_index_has() -> None:
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         assert "pip install turbopi" not in page.read_text() and "'turbopi[" not in page.read_text(), page
+
+
+def test_a_page_of_the_documentation_is_named_where_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert manual("tutorial") == "docs/tutorial.md"
+    monkeypatch.setattr(installation, "__file__", str(tmp_path / "site-packages/turbopi/support/installation.py"))
+    about = Message()
+    about["Version"] = "0.1.0"
+    monkeypatch.setattr(metadata, "metadata", lambda name: about)
+    assert manual("tutorial") == "docs/tutorial.md of Turbo-Pi's documentation"
+    about["Project-URL"] = "Repository, https://here.example/turbopi"
+    assert manual("tutorial") == "https://here.example/turbopi/blob/v0.1.0/docs/tutorial.md"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from turbopi.support.text import data_size, did_you_mean, names_known, significant
+from turbopi.support.text import counted, data_size, denoising, did_you_mean, names_known, significant
 
 
 @pytest.mark.parametrize(
@@ -64,3 +64,8 @@ def test_what_was_probably_meant_is_asked(typed: str, question: str) -> None:
 def test_known_names_come_behind_what_was_probably_meant() -> None:
     assert names_known("robto", "keys are", ["robot", "prompt"]) == "did you mean robot? Keys are robot, prompt"
     assert names_known("qqq", "keys are", ["robot", "prompt"]) == "keys are robot, prompt"
+
+
+def test_one_of_a_thing_has_no_plural() -> None:
+    assert [counted(number, "step") for number in (0, 1, 2)] == ["0 steps", "1 step", "2 steps"]
+    assert [denoising({"num_denoising_steps": steps}) for steps in (1, 10)] == ["1 step", "10 steps"]

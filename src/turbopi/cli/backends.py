@@ -7,10 +7,13 @@ from rich.markup import escape
 
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.typed import as_typed
-from turbopi.support.errors import BackendUnavailable
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
     import torch
+
+    from turbopi.backends import Precision
+    from turbopi.config import PolicyConfig
 
 DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
 PrecisionOption = Annotated[
@@ -44,13 +47,16 @@ def resolve_gpu(device: str, purpose: str) -> "torch.device":
     return resolved
 
 
-def list_backends(device: str, precision: str) -> dict[str, Any]:
-    """Whether each backend can run here, in which precisions, and why not, as JSON values. Raises ConfigError."""
+def list_backends(device: str, precision: str, config: "PolicyConfig | None" = None) -> dict[str, Any]:
+    """Whether each backend can run here, in which precisions, and why not, as JSON values. Raises ConfigError.
+
+    config: a checkpoint's, for what runs its model; without one, a Pi0.5's.
+    """
     from turbopi import backends as registry
 
     resolved = registry.resolve_device(device)
     tier = registry.checked_precision(precision)
-    chosen, why = registry.choose(resolved, tier)
+    chosen, why = registry.choose(resolved, tier, *(() if config is None else (config.model,)))
     why = as_typed(why)
     try:
         registry.check(chosen, resolved, tier)
@@ -60,7 +66,7 @@ def list_backends(device: str, precision: str) -> dict[str, Any]:
     listed = [
         {
             "name": spec.name,
-            "available": (reason := registry.availability(spec.name, resolved)) is None,
+            "available": (reason := _why_not(spec.name, resolved, tier, config)) is None,
             "reason": reason,
             "precisions": list(registry.precisions(spec.name)),
             "summary": spec.summary,
@@ -76,6 +82,21 @@ def list_backends(device: str, precision: str) -> dict[str, Any]:
         "auto_runs": runs,
         "backends": listed,
     }
+
+
+def _why_not(name: str, device: "torch.device", tier: "Precision", config: "PolicyConfig | None") -> str | None:
+    from turbopi import backends
+    from turbopi.quantization.plan import TIERS
+
+    if (reason := backends.availability(name, device)) is not None or config is None:
+        return reason
+    own = backends.precisions(name)
+    if set(own) <= set(TIERS):
+        try:
+            _ = config.planned_model
+        except ConfigError:
+            return f"calibrations are for Pi0 and Pi0.5 alone, and this is a {config.model.kind}"
+    return backends.refusal(name, device, tier if tier in own else own[0], config.model)
 
 
 def show_backends(found: dict[str, Any], output: Output) -> None:

@@ -79,12 +79,13 @@ def build(
     from turbopi.backends.tensorrt.engines import for_this_gpu
     from turbopi.backends.tensorrt.parts import SLOTS, EngineShape, fingerprint
 
+    opened = options.open(checkpoint)
+    _ = opened.config.planned_model  # which other families don't have: better known before a library is installed
     resolved = backends.resolve_device(device)
     backend = "tensorrt_fp8" if precision == "fp8" else "tensorrt"
     for reason in (backends.availability(backend, resolved), calibrate.unavailable(method)):
         if reason is not None:
             raise BackendUnavailable(f"can't build engines for {backend}: {reason}")
-    opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
     from turbopi.backends.pytorch import reference_model
     from turbopi.engine.weights import pack

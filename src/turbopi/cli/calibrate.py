@@ -12,7 +12,7 @@ from turbopi.cli.options import MOST_NOISES, MOST_OBSERVATIONS, CheckpointArgume
 from turbopi.cli.progress import with_stages
 from turbopi.config import LIMITS
 from turbopi.support.errors import ConfigError
-from turbopi.support.text import significant
+from turbopi.support.text import counted, significant
 
 if TYPE_CHECKING:
     from turbopi.calibrate.report import ActionsError
@@ -92,7 +92,7 @@ def calibrate(
     tokenizer: Annotated[str | None, typer.Option("--tokenizer", metavar="FILE", help="SentencePiece model.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Prepare a checkpoint for FP8 or INT8: scales of every activation, and which products had better stay in bf16.
+    """Prepare a checkpoint for FP8 or INT8: scales of every activation, and which matmuls had better stay in bf16.
 
     Runs the float32 policy on your observations over all denoising steps, tries several ways to choose scales, and
     measures the error of the actions on observations that were held out. The file that it writes holds for these
@@ -154,7 +154,7 @@ def _show(result: "Quantization", output: Output) -> None:
     seen, worst = report.observations, report.held_out.worst
     output.line(
         f"{report.model}: {len(seen.calibration)} observations ({seen.source}), {len(seen.held_out)} more "
-        f"held out; noises for each: {seen.noises}; {report.steps} steps, on {report.device}"
+        f"held out; noises for each: {seen.noises}; {counted(report.steps, 'step')}, on {report.device}"
     )
     methods = ", ".join(f"{name} {significant(error.relative_rms)}" for name, error in report.methods.items())
     output.line(f"scales chosen by {report.method} (the actions' relative rms with each way: {methods})")

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
 from turbopi.support.files import write_whole
+from turbopi.support.installation import install_command
 from turbopi.support.text import data_size, denoising
 
 if TYPE_CHECKING:
@@ -152,7 +154,7 @@ def _show(info: dict[str, Any], output: Output) -> None:
     parameters.add_column("part")
     parameters.add_column("count", justify="right")
     for part, count in info["parameters"].items():
-        if part != "total":
+        if part != "total" and count:
             parameters.add_row(PART_NAMES.get(part, part), f"{count:,}")
     parameters.add_section()
     parameters.add_row("total", f"{info['parameters']['total']:,}", style="bold")
@@ -202,23 +204,30 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _tokenizer(info: dict[str, Any]) -> str:
+    from turbopi.models import FAMILIES
     from turbopi.preprocess.tokenizer import cached_tokenizer
 
-    if info["tokenizers"]:
-        return ", ".join(info["tokenizers"])
     if info["format"] == "random":
         return "Turbo-Pi's own small one"
+    own = not FAMILIES[info["kind"]].paligemma  # of another kind, which a library reads
     cached = cached_tokenizer()
-    if cached.is_file():
-        return f"none in the folder; openpi's: {cached}"
-    return "not found: `turbopi doctor --checkpoint` says where to get it"
+    if info["tokenizers"]:
+        found = ", ".join(info["tokenizers"])
+    elif not own and cached.is_file():
+        found = f"none in the folder; openpi's: {cached}"
+    else:
+        found = "not found: `turbopi doctor --checkpoint` says where to get it"
+    if own and find_spec("tokenizers") is None:
+        found += f"; it needs the library tokenizers, which isn't installed: {install_command('smolvla')}"
+    return found
 
 
 def _made_in(info: dict[str, Any]) -> str:
     if "max_decoding_steps" not in info:
         return f"denoising in {denoising(info)}"
-    found = info["action_tokenizers"] or ["which isn't here"]
-    return f"written in {denoising(info)}, read by the action tokenizer {found[0]}"
+    found = info["action_tokenizers"]
+    where = found[0] if found else "which isn't here: `turbopi doctor --checkpoint` says where to get it"
+    return f"written in {denoising(info)}, read by the action tokenizer{' ' if found else ', '}{where}"
 
 
 def _statistics_source(info: dict[str, Any]) -> str:

@@ -38,7 +38,7 @@ def examine(opened: Any, about_it: list[Row], *, tokenizer: str | None, port: in
     yield check_memory(None if opened is None else weights_gb(opened))
     yield from about_it
     if opened is not None or not about_it:  # a checkpoint that can't be opened hides its tokenizer
-        yield check_tokenizer(tokenizer, opened)
+        yield from check_tokenizer(tokenizer, opened)
     yield check_port(port)
     yield check_disk(Path.cwd())
 
@@ -115,7 +115,8 @@ def check_cpu() -> Row:
     cores = psutil.cpu_count(logical=False)
     usable = usable_processors()
     threads = None if torch is None else torch.get_num_threads()
-    found = f"{cores or '?'} cores, {usable} usable CPUs, PyTorch uses {threads} threads"
+    used = f"{threads} threads" if threads != 1 else "1 thread"
+    found = f"{cores or '?'} cores, {usable} usable CPUs, PyTorch uses {used}"
     if threads is not None and threads > usable:
         return Row("WARN", "CPU", found, f"set OMP_NUM_THREADS={usable}: more threads than CPUs are slow")
     load = psutil.getloadavg()[0]
@@ -185,7 +186,7 @@ def open_for_check(path: str, config: str | None, device: str) -> tuple[Any, lis
     info = opened.info()
     found = (
         f"{info['path']}: {info['format']}, {info['kind']}, {info['name']} for {info['robot']}, "
-        f"{info['parameters']['total'] / 1e6:,.0f} M parameters"
+        f"{_millions(info['parameters']['total'])} parameters"
     )
     rows = [Row("OK", "checkpoint", found)]
     if (kept := own_precision(opened)) is not None:
@@ -198,6 +199,10 @@ def open_for_check(path: str, config: str | None, device: str) -> tuple[Any, lis
     return opened, rows
 
 
+def _millions(count: int) -> str:
+    return f"{count / 1e6:,.0f} M" if count >= 1e6 else f"{count:,}"
+
+
 def own_precision(opened: Any) -> Any:
     """What an opened checkpoint's weights run in alone; None where there is a choice, or no checkpoint."""
     if opened is None:  # nor, maybe, a PyTorch that can be imported
@@ -207,8 +212,11 @@ def own_precision(opened: Any) -> Any:
     return precision_kept(opened)
 
 
-def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
-    """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning."""
+def check_tokenizer(given: str | None, checkpoint: Any) -> list[Row]:
+    """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning.
+
+    Of a checkpoint whose model writes its actions as tokens also the action tokenizer.
+    """
     from turbopi.config import ModelConfig
     from turbopi.preprocess.tokenizer import load_tokenizer, tokenizer_of
 
@@ -221,9 +229,22 @@ def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
         first, *rest = as_typed(str(error)).splitlines()
         fix = " && ".join(line.strip() for line in rest if "curl" in line or "mkdir" in line) or "see the message"
         if checkpoint is None and given is None:
-            return Row("WARN", "tokenizer", "PaliGemma's isn't here; a real checkpoint needs it", fix)
-        return Row("FAIL", "tokenizer", first.removesuffix(". Looked for:"), fix)
-    return Row("OK", "tokenizer", loaded.source)
+            return [Row("WARN", "tokenizer", "PaliGemma's isn't here; a real checkpoint needs it", fix)]
+        rows = [Row("FAIL", "tokenizer", first.removesuffix(". Looked for:"), fix)]
+    else:
+        rows = [Row("OK", "tokenizer", loaded.source)]
+    return rows if checkpoint is None else [*rows, *_action_tokenizer(checkpoint)]
+
+
+def _action_tokenizer(checkpoint: Any) -> list[Row]:
+    from turbopi.preprocess.answers import action_tokenizers_of
+
+    try:
+        found = action_tokenizers_of(checkpoint)
+    except TurboPiError as error:
+        text, _, fix = as_typed(str(error)).partition(". Fetch it: ")
+        return [Row("FAIL", "action tokenizer", text, fix or "see the message")]
+    return [Row("OK", "action tokenizer", str(one)) for one in found[:1]]
 
 
 def check_port(port: int) -> Row:

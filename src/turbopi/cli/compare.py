@@ -15,6 +15,7 @@ from turbopi.cli.files import check_report
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import PolicyOptions
 from turbopi.support.errors import ConfigError
+from turbopi.support.text import counted
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -143,7 +144,9 @@ def _run_variants(
             visited.save()
             source.close()
         samples.append(visited.entries)
-    output.line(f"float32 reference, {variants[0].steps} steps, on {sum(map(len, samples))} observations")
+    output.line(
+        f"float32 reference, {counted(variants[0].steps, 'step')}, on {counted(sum(map(len, samples)), 'observation')}"
+    )
     exact = replace(variants[0], backend="pytorch", precision="f32")
     reference = _options_of(exact, options).local_policy(checkpoint, output)
     return results, [action_error(entries, reference) for entries in samples]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from turbopi.cli.framework import Output
 from turbopi.support.reading import plain_document
+from turbopi.support.text import counted
 
 if TYPE_CHECKING:
     from turbopi.evaluate.results import Episode, Results
@@ -53,7 +54,7 @@ def play_episodes(
 
     def reported(episode: "Episode", results: "Results") -> None:
         task = results.tasks[episode.task].instruction
-        output.line(f"  {task}: {episode.status} after {episode.steps} steps ({episode.seconds:.0f} s)")
+        output.line(f"  {task}: {episode.status} after {counted(episode.steps, 'step')} ({episode.seconds:.0f} s)")
 
     evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=plan, on_episode=reported)
     summary = results.summary()

@@ -10,6 +10,7 @@ from turbopi.cli.backends import DeviceOption, PrecisionOption, list_backends, r
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.support.errors import BackendUnavailable, ConfigError
 from turbopi.support.reading import plain_document
+from turbopi.support.text import counted
 
 STYLES = {"OK": "green", "WARN": "yellow", "FAIL": "bold red"}
 
@@ -72,14 +73,14 @@ def doctor(
     precision = precision or own_precision(opened) or "bf16"
     rows = list(examine(opened, about_it, tokenizer=tokenizer, port=port))
     works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
-    found = list_backends(device, precision) if works else {}
+    found = list_backends(device, precision, None if opened is None else opened.config) if works else {}
     width = max(len(row.name) for row in rows)
     for row in rows:  # lines and not a table, so that a command can be copied whole
         output.styled(f"[{STYLES[row.level]}]{row.level:<4}[/]  [bold]{row.name:<{width}}[/]  {escape(row.found)}")
         if row.fix:
             output.styled(f"{'':<{width + 8}}[cyan]->[/] {escape(row.fix)}")
     counts = {level: sum(row.level == level for row in rows) for level in STYLES}
-    summary = f"{counts['OK']} OK, {counts['WARN']} warnings, {counts['FAIL']} failed"
+    summary = f"{counts['OK']} OK, {counted(counts['WARN'], 'warning')}, {counts['FAIL']} failed"
     if found:
         show_backends(found, output)
     output.line(summary, STYLES["FAIL" if counts["FAIL"] else "OK"])

@@ -22,6 +22,7 @@ from turbopi.cli.tables import tell_apart
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
 from turbopi.support.reading import plain_document
+from turbopi.support.text import counted
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -309,8 +310,8 @@ def _reported(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
 def _line(episode: "Episode") -> str:
     why = f" ({as_typed(episode.message.strip().splitlines()[-1])})" if episode.message else ""
     return (
-        f"task {episode.task}, initial state {episode.initial_state}: {episode.status} after {episode.steps} steps, "
-        f"{episode.seconds:.0f} s{why}"
+        f"task {episode.task}, initial state {episode.initial_state}: {episode.status} after "
+        f"{counted(episode.steps, 'step')}, {episode.seconds:.0f} s{why}"
     )
 
 

@@ -72,12 +72,13 @@ def export(
     from turbopi.models.pi0.reference import Pi0Model
 
     check_target(Path(target).expanduser())  # before minutes of loading
+    checkpoint = options.open(source)
+    _ = checkpoint.config.planned_model  # which other families don't have: better known before a library is installed
     from turbopi.backends.tensorrt.calibrate import unavailable
 
     missing = missing_library(EXPORT_NEEDS) or (unavailable(method) if precision == "fp8" else None)
     if missing is not None:
         raise BackendUnavailable(f"can't export to ONNX: {missing}")
-    checkpoint = options.open(source)
     options.tell_if_random(checkpoint, output)
     started = time.perf_counter()
     found = None

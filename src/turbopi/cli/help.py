@@ -3,6 +3,7 @@
 Typer's own gives each option's names, short name, type and description a column, which leaves 20 for the last.
 """
 
+import shutil
 from typing import Any
 
 import typer
@@ -46,6 +47,8 @@ def show_all(ctx: typer.Context, wanted: bool) -> None:
 def show_help(command: Any, ctx: Any, *, whole: bool) -> None:
     """Print usage, what the command does, its options and examples."""
     console = Console(highlight=False)
+    if console.is_dumb_terminal:  # for which rich takes 80
+        console.size = shutil.get_terminal_size()
     console.width = min(console.width, WIDEST)
     console.print()
     console.print(Text(command.get_usage(ctx), "bold"))

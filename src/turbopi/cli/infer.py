@@ -119,7 +119,7 @@ def infer(
     _check_targets(Path(source), out, drawing)
     for file in (out, drawing):
         if file is not None and file.exists():
-            output.line(f"note: {file} is there, and is replaced; --out names another file", "yellow")
+            output.line(f"note: {file} is there, and will be replaced; --out names another file", "yellow")
     from turbopi.robots import read_state
 
     sources = _sources(Path(source), call)
@@ -137,8 +137,8 @@ def infer(
     noted, ranges = _Notes(output), checks.drawn
     noted.of(sources[0], checks.reading(seen))
     model = opened.config.model
-    if noise is not None and (why := family_of(model).refuses_flow) is not None:
-        raise ConfigError(f"--noise: {why}")
+    if (noise is not None or seed is not None) and (why := family_of(model).refuses_flow) is not None:
+        raise ConfigError(f"{'--seed' if noise is None else '--noise'}: {why}")
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
     policy = options.make_policy(opened, output)

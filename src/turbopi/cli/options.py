@@ -13,7 +13,7 @@ from turbopi.cli.process import interrupts_end_at_once, slow_import_reported
 from turbopi.cli.typed import as_typed
 from turbopi.config import PRESETS, typed_grid
 from turbopi.support.errors import ConfigError
-from turbopi.support.text import denoising
+from turbopi.support.text import data_size, denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -328,7 +328,7 @@ class PolicyOptions(RobotOptions):
             about["backend_reason"] = "auto: the folder holds ONNX graphs"
         loaded = ""  # a backend of another package may load no weights
         if "weight_bytes" in about:
-            loaded = f"; weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
+            loaded = f"; weights: {data_size(about['weight_bytes'])} in {about['load_seconds']:.1f} s"
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
             f"({about['device_name']}), {denoising(about)}{loaded}"

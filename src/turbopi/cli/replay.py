@@ -18,6 +18,7 @@ from turbopi.cli.options import MOST_CALLS, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import as_typed
 from turbopi.support.errors import ConfigError
+from turbopi.support.text import counted
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -233,9 +234,10 @@ def _run(
     selection = select(episodes, every, affordable(seconds, first.changes))
     rate = "" if data.fps is None else f", {data.fps:g} steps a second: a chunk covers {first.horizon / data.fps:.2g} s"
     output.line(f"{data.path}: {data.kind}{rate}")
+    each = "" if selection.every == 1 else f", one in {selection.every}"
     output.line(
-        f"{selection.count} of {selection.of_moments:,} moments, every {selection.every} of {len(selection.episodes)} "
-        f"of {selection.of_episodes} episodes, {seconds * 1e3:.0f} ms each"
+        f"{selection.count} of {counted(selection.of_moments, 'moment')}{each}, from {len(selection.episodes)} of "
+        f"{counted(selection.of_episodes, 'episode')}, {seconds * 1e3:.0f} ms each"
     )
     report = Report(data, selection, settings, first, run(first, selection), opened)
     if second is not None:

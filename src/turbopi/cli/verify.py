@@ -13,7 +13,7 @@ from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.support.files import write_whole
 from turbopi.support.reading import as_document, plain_document
-from turbopi.support.text import cosine, denoising, significant
+from turbopi.support.text import cosine, counted, denoising, significant
 
 if TYPE_CHECKING:
     from turbopi.verify.document import CalibrationDetails, Certificate, Dimension, IntermediateDocument
@@ -153,7 +153,9 @@ def _show(document: "Certificate", output: Output) -> None:
         f"relative rms {significant(worst.relative_rms)}, cosine {cosine(worst.cosine)}"
     )
     for title, time in ((subject, document.latency_ms.backend), (document.oracle, document.latency_ms.oracle)):
-        output.line(f"latency of {title}: median {time.p50:.2f} ms, p95 {time.p95:.2f} ms, {time.calls} calls")
+        output.line(
+            f"latency of {title}: median {time.p50:.2f} ms, p95 {time.p95:.2f} ms, {counted(time.calls, 'call')}"
+        )
     if document.gpu_bytes is not None:
         output.line(f"GPU memory of {subject}, weights and all that stays: {document.gpu_bytes / 1e9:.2f} GB")
     gpu = document.provenance.gpu

@@ -9,6 +9,7 @@ from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.files import check_writable
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.support.errors import ConfigError
+from turbopi.support.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -124,5 +125,7 @@ def _draw(
     finally:
         drawing.close()
     shown = "shown in the viewer" if save is None else f"written to {save}"
-    output.line(f"{calls} calls, {troubles} errors and gaps, {shown}")
+    output.line(
+        f"{counted(calls, 'call')}, {'1 error or gap' if troubles == 1 else f'{troubles} errors and gaps'}, {shown}"
+    )
     output.document({"calls": calls, "troubles": troubles, "saved": save})

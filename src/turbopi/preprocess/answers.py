@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,21 @@ def reader_of(checkpoint: Checkpoint, tokenizer: PromptTokenizer) -> AnswerReade
     make = family_of(model).reader
     if make is None:
         return None
+    there = action_tokenizers_of(checkpoint)
+    found = make(model, tokenizer.encoder, there[0] if there else None)  # type: ignore[arg-type]  # which checks it
+    for other in there[1:]:
+        if FastTokenizer.from_folder(other) != FastTokenizer.from_folder(there[0]):
+            logger.warning("the action tokenizer in %s isn't the one that is used, %s", other, there[0])
+    return found
+
+
+def action_tokenizers_of(checkpoint: Checkpoint) -> list[Path]:
+    """The folders that have one, of a model that writes its actions as tokens, the one that is used first; else [].
+
+    Raises TokenizerError if there is none.
+    """
+    if family_of(checkpoint.config.model).reader is None:
+        return []
     there = [one for one in checkpoint.action_tokenizers if (one / SETTINGS).is_file()]
     if not there and checkpoint.format != "random":
         looked = "".join(f"{one}, " for one in checkpoint.action_tokenizers)
@@ -56,8 +72,4 @@ def reader_of(checkpoint: Checkpoint, tokenizer: PromptTokenizer) -> AnswerReade
             f"cache. Fetch it: `hf download {checkpoint.action_tokenizer_name}`; or say in a turbopi.json where it is: "
             '{"action_tokenizer": "/path/to/it"}'
         )
-    found = make(model, tokenizer.encoder, there[0] if there else None)  # type: ignore[arg-type]  # which checks it
-    for other in there[1:]:
-        if FastTokenizer.from_folder(other) != FastTokenizer.from_folder(there[0]):
-            logger.warning("the action tokenizer in %s isn't the one that is used, %s", other, there[0])
-    return found
+    return there

@@ -21,10 +21,24 @@ def install_command(extra: str = "") -> str:
     return f"{pip} install {_requirement(f'[{extra}]' if extra else '')}"
 
 
+def manual(page: str) -> str:
+    """Where docs/PAGE.md is to be read: in the clone, or in the repository that a wheel names."""
+    path = f"docs/{page}.md"
+    if (_clone() / path).is_file():
+        return path
+    try:
+        about = metadata.metadata("turbopi")
+    except metadata.PackageNotFoundError:
+        return f"{path} of Turbo-Pi's documentation"
+    urls = dict(one.split(", ", 1) for one in about.get_all("Project-URL") or [])
+    if "Repository" in urls:
+        return f"{urls['Repository']}/blob/v{about['Version']}/{path}"
+    return f"{path} of Turbo-Pi's documentation"
+
+
 def _requirement(extra: str) -> str:
-    clone = Path(__file__).resolve().parents[3]
-    if (clone / "pyproject.toml").is_file():
-        return f"-e '{clone}{extra}'"
+    if (_clone() / "pyproject.toml").is_file():
+        return f"-e '{_clone()}{extra}'"
     origin = _origin()
     address = str(origin.get("url", ""))
     if "vcs_info" in origin:
@@ -33,6 +47,11 @@ def _requirement(extra: str) -> str:
     if address.startswith("file:"):
         return f"'{unquote(urlsplit(address).path)}{extra}'"
     return f"'turbopi{extra} @ {address}'" if address else f"'turbopi{extra}'"
+
+
+def _clone() -> Path:
+    """Where the clone would be."""
+    return Path(__file__).resolve().parents[3]
 
 
 def _origin() -> dict[str, Any]:

@@ -28,6 +28,11 @@ def data_size(count: float) -> str:
     return f"{count:.0f} bytes"
 
 
+def counted(number: int, what: str) -> str:
+    """A number and what it counts: "1 step", "10 steps"."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
 def did_you_mean(typed: str, known: Iterable[str]) -> str:
     """A question with the known names that were probably meant: "did you mean a or b?"; "" if there are none.
 
@@ -54,7 +59,7 @@ def denoising(about: Mapping[str, object]) -> str:
     """ "10 steps" of a policy's metadata, and its solver and time grid where they aren't openpi's."""
     if "max_decoding_steps" in about:
         return f"at most {about['max_decoding_steps']} tokens"
-    said = f"{about.get('num_denoising_steps')} steps"
+    said = "1 step" if (steps := about.get("num_denoising_steps")) == 1 else f"{steps} steps"
     solver, grid = about.get("solver", "euler"), about.get("time_grid", "uniform")
     if solver != "euler":
         said += f" of {solver}"
