@@ -195,6 +195,14 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
         judged(exact[0][:9])
 
 
+def test_where_neither_the_backend_nor_other_weights_change_the_actions_nothing_is_judged() -> None:
+    """As zeros do, which stand in for an answer of tokens that can't be read."""
+    nothing, some = demo.Difference(0.0, 0.0), demo.Difference(1e-9, 1e-9)
+    for differences, ok in (([nothing], None), ([nothing, some], False)):
+        check = demo.OracleCheck(differences, 0.0, 10.0, np.zeros((len(differences), 2, 7)))
+        assert check.ok is ok and check.as_json()["ok"] is ok
+
+
 @pytest.mark.slow
 def test_a_fault_in_one_of_several_frames_fails_the_check() -> None:
     """Faults make 73 times the control and more: seven times the bound, in one of six frames nearly three times."""

@@ -152,7 +152,7 @@ def qualify(monkeypatch: pytest.MonkeyPatch, found: Verdict, *options: str) -> t
     monkeypatch.setattr("turbopi.cli.checkups.check_gpu", list)
     monkeypatch.setattr(backends, "refusal", lambda *given: None)
     monkeypatch.setattr(backends, "resolve_device", lambda device: torch.device("cuda", 0))
-    monkeypatch.setattr(doctor, "list_backends", lambda device, precision: {})
+    monkeypatch.setattr(doctor, "list_backends", lambda *_: {})
     monkeypatch.setattr(qualifying, "_verdict", lambda *given: found)
     monkeypatch.setattr(qualifying, "_attempt", lambda *given: qualifying._Run(finished=True))
     result = turbopi("doctor", "--qualify", "--json", *options)

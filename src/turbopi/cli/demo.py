@@ -107,7 +107,7 @@ def demo(
     run.play(report / "episodes", episodes)
     run.report_to(report)
     output.line(f"{NEXT} From there to a robot that moves: {manual('tutorial')}")
-    if not run.check.ok:
+    if run.check.ok is False:
         raise typer.Exit(CHECK_FAILED)
 
 
@@ -223,7 +223,7 @@ class _Run:
         for number, difference in enumerate(check.differences):
             table.add_row(str(number), significant(difference.max), significant(difference.rms))
         table.add_section()
-        verdict = "" if check.control == 0 else "[green]ok[/]" if check.ok else "[bold red]FAIL[/]"
+        verdict = "" if check.ok is None else "[green]ok[/]" if check.ok else "[bold red]FAIL[/]"
         table.add_row("all", *map(significant, (of_all.max, of_all.rms, check.bound)), verdict)
         self.output.table(table)
         precision = self.metadata["precision"]
@@ -236,7 +236,7 @@ class _Run:
         )
         backend = self.metadata["backend"]
         error, bound = significant(of_all.rms), significant(check.bound)
-        if check.control == 0:
+        if check.ok is None:
             self.output.line(
                 "Nothing was judged: the reference's own actions don't change with its weights. Where a model writes "
                 "tokens, zeros stand in for an answer that can't be read: take its robot's own observations, with "
