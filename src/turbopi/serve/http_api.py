@@ -92,7 +92,7 @@ class PortConnection(GuardedConnection):
         self._again = again
         self._post: Post | None = None
         self._first: bytes | None = b""
-        self._refused = False  # why its request is none
+        self._refused = False  # with a 400, once
 
     def next_one(self) -> "PortConnection":
         """The socket's next one, which this client goes on with."""
