@@ -326,15 +326,10 @@ def test_a_client_that_does_not_call_answers_pings_and_the_servers_goodbye() -> 
         connection.close()  # waits for the client's
         left.set()
 
-    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None, close_timeout=600) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
-            assert ponged.wait(60) and left.wait(60)
-            with pytest.raises(ServerLost, match="went away"):
-                client.infer({})
-        server.shutdown()
-        thread.join()
+    with client_of(handle, close_timeout=600) as client:
+        assert ponged.wait(60) and left.wait(60)
+        with pytest.raises(ServerLost, match="went away"):
+            client.infer({})
 
 
 def test_the_threads_of_a_client_end_with_it() -> None:
@@ -358,6 +353,20 @@ def test_the_threads_of_a_client_end_with_it() -> None:
 
 
 @contextmanager
+def client_of(handle: Callable[[Any], None], **options: Any) -> Iterator[RealTimeClient]:
+    """A client of a server that does this with each connection."""
+    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None, **options) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
+                yield client
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
 def foreign(metadata: dict[str, Any], *answers: Any) -> Iterator[tuple[RealTimeClient, list[dict[str, Any]]]]:
     """A client of a server that gives these answers whatever it is sent, and the messages that it got."""
     received: list[dict[str, Any]] = []
@@ -370,15 +379,8 @@ def foreign(metadata: dict[str, Any], *answers: Any) -> Iterator[tuple[RealTimeC
                 connection.send(answer if isinstance(answer, str) else pack(answer))
             connection.recv()
 
-    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
-                yield client, received
-        finally:
-            server.shutdown()
-            thread.join()
+    with client_of(handle) as client:
+        yield client, received
 
 
 def test_what_another_server_answers_gets_through_as_a_chunk_of_finite_numbers_alone() -> None:
@@ -406,26 +408,17 @@ def test_an_answer_that_nobody_asked_for_is_not_the_next_calls(idle: bool, monke
                 came.set()
             connection.recv()
 
-    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
-                assert client.infer({"place": 1.0})["actions"] == 1
-                assert client._socket is not None
-                stream = client._socket._stream
-                # Both answers may have come as one.
-                assert (
-                    came.wait(60)
-                    if idle
-                    else wait_for(lambda: stream._events or select.select([stream.socket], [], [], 0)[0])
-                )
-                with pytest.raises(ServerLost, match="an answer that nobody asked for"):
-                    client.infer({"place": 2.0})
-                assert client.infer({"place": 3.0})["actions"] == 3
-        finally:
-            server.shutdown()
-            thread.join()
+    with client_of(handle) as client:
+        assert client.infer({"place": 1.0})["actions"] == 1
+        assert client._socket is not None
+        stream = client._socket._stream
+        # Both answers may have come as one.
+        assert (
+            came.wait(60) if idle else wait_for(lambda: stream._events or select.select([stream.socket], [], [], 0)[0])
+        )
+        with pytest.raises(ServerLost, match="an answer that nobody asked for"):
+            client.infer({"place": 2.0})
+        assert client.infer({"place": 3.0})["actions"] == 3
 
 
 def test_the_chunks_of_a_batch_message_are_each_checked() -> None:

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from turbopi.policy.shipped import Frame
     from turbopi.verify.demo import OracleCheck
 
-NEXT = "next, with your own: turbopi inspect CHECKPOINT, then turbopi infer CHECKPOINT OBSERVATION."
+NEXT = (
+    "next, with your own: turbopi inspect CHECKPOINT, then turbopi infer CHECKPOINT OBSERVATION. From there to a robot "
+    "that moves: "
+)
 
 
 @command(
@@ -88,7 +91,7 @@ def demo(
 
         output = Output(as_json)
         show_real_time(options, checkpoint, episodes, seed, report, output)
-        output.line(f"{NEXT} From there to a robot that moves: {manual('tutorial')}")
+        output.line(NEXT + manual("tutorial"))
         return
     if episodes is not None and episodes > 20:
         raise ConfigError(f"--episodes is {episodes}; LIBERO's part of the demo plays 20 at most (turbopi eval libero)")
@@ -106,7 +109,7 @@ def demo(
     run = _Run(options, checkpoint, frames, seed, output)
     run.play(report / "episodes", episodes)
     run.report_to(report)
-    output.line(f"{NEXT} From there to a robot that moves: {manual('tutorial')}")
+    output.line(NEXT + manual("tutorial"))
     if run.check.ok is False:
         raise typer.Exit(CHECK_FAILED)
 

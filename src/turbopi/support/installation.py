@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 import sys
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -26,13 +27,11 @@ def manual(page: str) -> str:
     path = f"docs/{page}.md"
     if (_clone() / path).is_file():
         return path
-    try:
+    with suppress(metadata.PackageNotFoundError):
         about = metadata.metadata("turbopi")
-    except metadata.PackageNotFoundError:
-        return f"{path} of Turbo-Pi's documentation"
-    urls = dict(one.split(", ", 1) for one in about.get_all("Project-URL") or [])
-    if "Repository" in urls:
-        return f"{urls['Repository']}/blob/v{about['Version']}/{path}"
+        urls = dict(one.split(", ", 1) for one in about.get_all("Project-URL") or [])
+        if "Repository" in urls:
+            return f"{urls['Repository']}/blob/v{about['Version']}/{path}"
     return f"{path} of Turbo-Pi's documentation"
 
 
