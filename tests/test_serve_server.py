@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from prometheus_client import Histogram
 from prometheus_client.parser import text_string_to_metric_families
 from serve_fakes import NO_CHUNKS, FakePolicy, PipelinedFakePolicy, http_get, observation
 from websockets.asyncio.client import ClientConnection, connect
@@ -317,6 +318,25 @@ def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pyt
     assert len(reported) == 2
     assert re.fullmatch(r"127\.0\.0\.1:\d+ connected", reported[0])
     assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", reported[1])
+
+
+def test_an_answer_is_counted_before_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The policy's thread does both: who reads the metrics behind an answer finds it there."""
+    observe = Histogram.observe
+
+    def late(self: Histogram, *arguments: Any) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            time.sleep(0.05)
+        observe(self, *arguments)
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            await infer(connection, observation("one"))
+            for name in ("queue_seconds", "batch_size", "inference_seconds"):
+                assert metric(server, f"turbopi_{name}_count") == 1, name
+
+    monkeypatch.setattr(Histogram, "observe", late)
+    served(test)
 
 
 def test_who_leaves_with_its_answer_has_been_answered(

@@ -255,10 +255,9 @@ class PolicyCalls:
 
     def _run_turn(self, turn: tuple[Request, ...]) -> Ran:
         now = time.perf_counter()
-        ran = self._run_calls([request.call for request in turn])
         for request in turn:
             self._metrics.queue_seconds.observe(now - request.queued)
-        return ran
+        return self._run_calls([request.call for request in turn])
 
     def _run_calls(self, calls: Sequence[_Call]) -> Ran:
         if len(calls) == 1:
@@ -291,11 +290,11 @@ class PolicyCalls:
             self._metrics.batch_size.observe(1)
             future = self._submit_to_policy(observation)
             return Ran([future], time.perf_counter() - started)
-        result = self._infer(observation, call.arguments)
+        self._metrics.batch_size.observe(1)
+        result = self._counted(self._infer(observation, call.arguments))
         if call.answer is not None and result.error is None and not self.waiting:
             call.answer(result)
-        self._metrics.batch_size.observe(1)
-        return Ran([[self._counted(result)]], None if result.error else result.seconds)
+        return Ran([[result]], None if result.error else result.seconds)
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Result:
         if OBSERVE in arguments:
