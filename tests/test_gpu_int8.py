@@ -1,4 +1,7 @@
-"""INT8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
+"""INT8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases.
+
+On Hopper its own kernels run, with the expert in bfloat16, and the portable ones, with the expert's weights in INT8.
+"""
 
 from functools import lru_cache
 from typing import Any, cast
@@ -9,9 +12,10 @@ from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends.fused import FusedBackend
+from turbopi.backends.fused import INT8_ON_HOPPER, FusedBackend
 from turbopi.config import PiKind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
+from turbopi.kernels.ops import KERNELS_VARIABLE, forced_portable
 from turbopi.kernels.portable.denoise.packing import refusal
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.reference import Pi0Model
@@ -31,6 +35,17 @@ pytestmark = [
 ]
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 STEPS = 10
+KERNELS = ["auto", "portable"] if HERE == (9, 0) else ["auto"]
+
+
+@pytest.fixture(params=KERNELS, autouse=True)
+def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv(KERNELS_VARIABLE, request.param)
+    return str(request.param)
+
+
+def expert_in_int8() -> bool:
+    return HERE != (9, 0) or forced_portable()
 
 
 @lru_cache
@@ -44,8 +59,12 @@ def quantization(kind: PiKind, target: float) -> Quantization:
     return golden_calibration(golden_folder(), kind, torch.device("cuda", 0), target, INT8)
 
 
-@lru_cache
 def backend(kind: PiKind, target: float = 0.0) -> backends.Backend:
+    return made(kind, target, forced_portable())
+
+
+@lru_cache
+def made(kind: PiKind, target: float, portable: bool) -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     return backends.create(
         "fused",
@@ -61,7 +80,7 @@ def emulated(case: Case, target: float, expert: bool = True) -> tuple[Tensor, Te
     """(float32, float32 with the plan's sites rounded, the expert's among them), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
     plan = chosen.plan(model.config, "int8")
-    in_kernel = expert and refusal(model.config) is None and plan.expert == "int8"
+    in_kernel = expert and expert_in_int8() and refusal(model.config) is None and plan.expert == "int8"
     used = {
         site: plan.scales[str(site)]
         for site in sites(model.config)
@@ -98,7 +117,8 @@ def test_a_batch_is_as_far_from_float32_as_its_emulation_with_a_bf16_expert() ->
     runner: Any = backend("pi05")
     ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS).actions
     assert all(is_as_far_off(row[None], exact, expected) for row in ours)
-    assert runner.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"
+    plan = runner.describe()["int8"]["plan"]
+    assert not expert_in_int8() or plan["expert of batches"] == "bf16, as operations denoise"
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -147,4 +167,7 @@ def test_repeated_calls_are_bit_identical_and_the_denoising_kernel_runs() -> Non
     assert isinstance(runner, FusedBackend)
     first, again = (runner.sample(one.observation, one.noise, STEPS).actions.clone() for _ in range(2))
     assert torch.equal(first, again)
-    assert runner.describe()["int8"]["plan"]["expert"] == "int8"
+    expert = runner.describe()["int8"]["plan"]["expert"]
+    assert expert == "int8" if expert_in_int8() else expert.endswith(INT8_ON_HOPPER)
+    products = runner.describe()["operations"]
+    assert ("INT8 products" in products) == (not expert_in_int8()), "Hopper's own"

@@ -1,4 +1,4 @@
-"""E4M3: the rounding itself, the kernels that round to it, and the products of its numbers.
+"""E4M3: the rounding itself, the kernels that round to it, and the products of its numbers, on Hopper of int8, too.
 
 Triton's interpreter can't round to E4M3, so without a GPU the kernels are shown to hand over the right float32; on a
 GPU the bits are compared with PyTorch's.
@@ -22,7 +22,9 @@ from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.kernels.sm90.instructions import SHARED_BYTES  # noqa: E402
+from turbopi.quantization.formats import INT8  # noqa: E402
 from turbopi.quantization.fp8 import E4M3, E4M3_MAX, ScaledMatrix, input_of, to_e4m3  # noqa: E402
+from turbopi.quantization.int8 import to_int8  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -262,6 +264,96 @@ def test_repetition_is_bit_identical() -> None:
     run: Callable[[], Tensor] = lambda: gemm_fp8.matmul_fp8(x, matrix, Tile(3, 192, splits=4), "partial")  # noqa: E731
     first = run()
     assert all(torch.equal(run(), first) for _ in range(5))
+
+
+# Whole numbers
+
+
+def whole_operands(m: int, n: int, k: int) -> tuple[Tensor, ScaledMatrix]:
+    matrix = quantize(random(n, k) / k**0.5, 0.02, format=INT8)
+    return to_int8(random(m, k), matrix.inverse), matrix
+
+
+WHOLE_TILES = [Tile(2, 112), Tile(2, 256), Tile(1, 80), Tile(2, 96, cluster_m=2, cluster_n=2), Tile(3, 192, ring=5)]
+
+
+@on_hopper
+@pytest.mark.parametrize("tile", WHOLE_TILES)
+@pytest.mark.parametrize("epilogue", ["plain", "bias", "gelu", "geglu"])
+@pytest.mark.parametrize("out_int8", [False, True])
+@pytest.mark.parametrize(("m", "n", "k"), [(560, 2048, 1152), (1, 16, 16), (203, 4304, 80), (130, 264, 4304)])
+def test_products_of_int8(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile, out_int8: bool) -> None:
+    x, matrix = whole_operands(m, 2 * n if epilogue == "geglu" else n, k)
+    bias = random(n) if epilogue in ("bias", "gelu") else None
+    sums = matrix.product(x, bias)
+    exact = plain.gelu(sums) if epilogue == "gelu" else plain.geglu(sums) if epilogue == "geglu" else sums
+    inverse = 127 / float(exact.abs().max()) if out_int8 else None
+    ours = gemm_fp8.matmul_fp8(x, matrix, tile, epilogue, bias, inverse=inverse)
+    if inverse is not None:
+        off = (ours.int() - to_int8(exact, inverse).int()).abs()
+        assert ours.dtype == torch.int8 and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.02
+    else:
+        # the sums are exact: what is left is bfloat16's rounding, and the approximate tanh of GELU
+        assert ours.dtype == DTYPE
+        bound = 2.0**-8 * exact.abs() + (2.0**-10 if epilogue in ("gelu", "geglu") else 1e-6) * sums.abs().max()
+        assert bool(((ours.float() - exact).abs() <= bound).all())
+
+
+@on_hopper
+def test_int8s_largest_sums_and_parts_are_exact() -> None:
+    m, n, k = 130, 264, 16384
+    matrix = ScaledMatrix(
+        torch.full((n, k), 127, dtype=torch.int8, device=DEVICE), torch.ones(n, device=DEVICE), 1.0, torch.bfloat16
+    )
+    x = torch.full((m, k), -127, dtype=torch.int8, device=DEVICE)
+    x[3] = 1
+    expected = matrix.product(x)
+    parts = gemm_fp8.matmul_fp8(x, matrix, Tile(2, 96, splits=2), "partial")
+    assert torch.equal(parts.sum(0), expected)
+    gathered = Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True)
+    assert torch.equal(gemm_fp8.matmul_fp8(x, matrix, gathered, "bias"), expected.to(DTYPE))
+    stream = torch.zeros(m, n, dtype=DTYPE, device=DEVICE)
+    gemm_fp8.matmul_fp8(x, matrix, Tile(2, 96), "added", None, stream)
+    assert torch.equal(stream, expected.to(DTYPE))
+
+
+@on_hopper
+@pytest.mark.parametrize("epilogue", ["gelu", "geglu"])
+def test_what_int8_cannot_hold_is_marked_in_its_row(epilogue: Epilogue) -> None:
+    """Of a channel that is damaged in every row; of one whose sums are 0 but where its row isn't."""
+    x, matrix = whole_operands(70, 64 if epilogue == "geglu" else 32, 128)
+    bias = random(32) if epilogue == "gelu" else None
+
+    def marked() -> list[int]:
+        stream = torch.ones(70, 48, dtype=DTYPE, device=DEVICE)
+        gemm_fp8.matmul_fp8(x, matrix, Tile(1, 80), epilogue, bias, inverse=30.0, stream=stream)
+        assert bool(stream[:, 1:].isfinite().all())
+        return [int(row) for row in stream[:, 0].isnan().nonzero()]
+
+    assert marked() == []
+    matrix.scale[5] = torch.nan
+    assert marked() == list(range(70))
+    matrix.scale[5] = torch.inf
+    x[:, :] = torch.where(torch.arange(70, device=DEVICE)[:, None] == 66, x, 0)
+    assert 66 in marked()
+
+
+@pytest.mark.parametrize("rows", [11, 256, 512, 560, 976])
+@pytest.mark.parametrize(
+    ("n", "k", "epilogue"),
+    [
+        (3456, 1152, "bias"),
+        (1152, 4352, "partial"),
+        (2048, 16384, "parts"),
+        (16384, 2048, "geglu"),
+        (4352, 1152, "gelu"),
+    ],
+)
+def test_int8s_tile_has_a_width_of_its_instruction_and_no_overlap(
+    rows: int, n: int, k: int, epilogue: Epilogue
+) -> None:
+    tile = gemm_fp8.best_tile(rows, n, k, epilogue, 132, whole=True)
+    assert gemm_fp8.takes_whole(tile) and tile.splits <= -(-k // gemm_fp8.DEPTH)
 
 
 # Which tile

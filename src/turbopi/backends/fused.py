@@ -1,8 +1,8 @@
 """Backend `fused`: the call of `cuda_graph` with kernels of our own where they beat PyTorch's.
 
 Nothing is compiled by Inductor. On compute capability 9.0 the whole denoising loop, attention of vision and prefix, the
-prefix's feed-forward and many of vision's products are CUDA C++ kernels for it. On other GPUs, in INT8 and with
-TURBOPI_KERNELS=portable, they are the kernels of kernels/portable. A model, horizon or loop that the denoising kernels
+prefix's feed-forward and many of vision's products are CUDA C++ kernels for it. On other GPUs and with
+TURBOPI_KERNELS=portable they are the kernels of kernels/portable. A model, horizon or loop that the denoising kernels
 don't cover takes the engine's operations one by one. `describe()` says what runs.
 """
 
@@ -39,6 +39,8 @@ from turbopi.support.errors import BackendUnavailable, DeviceLost
 from turbopi.support.toolchain import missing_for_c
 
 logger = logging.getLogger(__name__)
+
+INT8_ON_HOPPER = "Hopper's denoising kernel has no INT8, and is faster in bf16 than the portable one in INT8"
 
 
 @runtime_checkable
@@ -122,7 +124,7 @@ class FusedBackend(CudaGraphBackend):
             if self._plan.expert != "bf16" and "jacobian" in batches:
                 plan["expert of batches guided by the Jacobian"] = "bf16, as its way back is"
 
-        kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
+        kernel = "one CUDA kernel" if self._hopper_denoises else "one portable CUDA kernel"
         denoising = {kernel: sorted({str(loop) for loop in self._made("single")})}
         for user, why in self._refused().items():
             kept = user.loop in self._made("keeper")
@@ -206,12 +208,19 @@ class FusedBackend(CudaGraphBackend):
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
 
         self._tiles = tiles_of(self.device)
-        self._on_hopper = hopper_kernels(self.device, self._without, self.precision)
+        self._on_hopper = hopper_kernels(self.device, self._without)
+        if self._on_hopper and self._plan is not None and self._plan.expert == "int8" and not self._kept_expert:
+            self._plan = self._plan.without_expert(INT8_ON_HOPPER)
         return fused_ops(self.device, self._tiles.table, self._without, self.precision)
 
     @property
+    def _hopper_denoises(self) -> bool:
+        """Whether denoising is by Hopper's kernel, which has no INT8: a folder may keep the expert's weights so."""
+        return self._on_hopper and (self._plan is None or self._plan.expert != "int8")
+
+    @property
     def _times_by_token(self) -> bool:
-        return self._on_hopper
+        return self._hopper_denoises
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
@@ -238,7 +247,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _guides_by_kernel(self, horizon: int) -> bool:
         """Whether one call guided by the true Jacobian goes forward in Hopper's denoising kernel."""
-        if not self._on_hopper or (self._plan is not None and self._plan.expert != "bf16"):
+        if not self._hopper_denoises or (self._plan is not None and self._plan.expert != "bf16"):
             return False
         from turbopi.kernels.portable.vjp.tiles import takes
         from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, unavailable
@@ -259,7 +268,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _denoises_pairs(self, horizon: int) -> bool:
         """Whether Hopper's kernel denoises two observations of such a horizon at once."""
-        if not self._on_hopper:
+        if not self._hopper_denoises:
             return False
         from turbopi.kernels.sm90.denoise.kernel import FEW, MAX_SUFFIX
         from turbopi.kernels.sm90.denoise.packing import refusal
@@ -320,7 +329,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _denoising_kernel(self, user: User, table: Tensor | None) -> Denoiser:
         """Raises BackendUnavailable for what it doesn't cover."""
-        if self._on_hopper:
+        if self._hopper_denoises:
             from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, unavailable
             from turbopi.kernels.sm90.denoise.packing import refusal
 
@@ -371,7 +380,7 @@ class FusedBackend(CudaGraphBackend):
         from turbopi.kernels.portable.denoise.packing import PackedExpert as Portable
         from turbopi.kernels.sm90.denoise.packing import PackedExpert as Hopper
 
-        kind: Any = Hopper if self._on_hopper else Portable
+        kind: Any = Hopper if self._hopper_denoises else Portable
         int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
         return kind.pack(
             self.config,

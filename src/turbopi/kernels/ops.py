@@ -12,6 +12,7 @@ from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.ops import portable_ops
+from turbopi.kernels.sm90.int8 import with_int8
 from turbopi.kernels.sm90.ops import hopper_ops
 from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
 from turbopi.support.errors import ConfigError
@@ -45,9 +46,9 @@ def forced_portable() -> bool:
     return value == "portable"
 
 
-def hopper_kernels(device: torch.device, without: Collection[str] = (), precision: str = "bf16") -> bool:
-    """Whether the kernels for compute capability 9.0 run on this device. `without` "sm90" and in "int8" no."""
-    return capability(device) == (9, 0) and not (forced_portable() or "sm90" in without or precision == "int8")
+def hopper_kernels(device: torch.device, without: Collection[str] = ()) -> bool:
+    """Whether the kernels for compute capability 9.0 run on this device. `without` "sm90" no."""
+    return capability(device) == (9, 0) and not (forced_portable() or "sm90" in without)
 
 
 def fused_ops(
@@ -60,7 +61,10 @@ def fused_ops(
     without  names of operations that failed their self-test on this GPU: PyTorch's take their place; "sm90": all of
              Hopper's
     """
-    ops = ops_of("hopper" if hopper_kernels(device, without, precision) else "portable", device, tiles)
+    on_hopper = hopper_kernels(device, without)
+    ops = ops_of("hopper" if on_hopper else "portable", device, tiles)
+    if on_hopper and precision == "int8":
+        ops = with_int8(ops, tiles)
     instead: dict[str, Any] = {one.name: getattr(BESIDE, one.name) for one in fields(Ops) if one.name in without}
     if not instead:
         return ops

@@ -242,7 +242,7 @@ def judge(certificate: Certificate, subject: Subject) -> None:
     why = certificate.verdict if not certificate.ok else f"{off[0].name} is off by {significant(off[0].relative_rms)}"
     path = DENOISE
     if any(one.name not in OF_DENOISING for one in off):
-        path = "sm90" if hopper_kernels(subject.device, subject.excluded, subject.precision) else ""
+        path = "sm90" if hopper_kernels(subject.device, subject.excluded) else ""
     raise Faulty(why, "" if path in subject.excluded else path)
 
 

@@ -43,6 +43,15 @@ class PrecisionPlan:
         """The denoising kernel takes all of the expert's matrices in one precision: bf16 if any is to be kept so."""
         return "bf16" if any(name.startswith("expert.") for name in self.kept) else self.format.name
 
+    def without_expert(self, reason: str) -> "PrecisionPlan":
+        """The same with the expert in bfloat16, for this reason."""
+
+        def others(of: Mapping[str, Any]) -> dict[str, Any]:
+            return {site: one for site, one in of.items() if not site.startswith("expert.")}
+
+        kept = {site: reason for site in [*self.scales, *self.kept] if site.startswith("expert.")}
+        return PrecisionPlan(self.tier, others(self.scales), others(self.kept) | kept, others(self.directions))
+
     @property
     def rounded(self) -> list[str]:
         """The sites whose matrices are rounded: of the expert's all or none."""

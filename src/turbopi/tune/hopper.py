@@ -162,12 +162,12 @@ class Product(ProductBench):
             )
         if one.normed:
             given = self.folded[copy]
-            return as_input(
-                matmul(self.raw, given, cut, epilogue, out=out, sums=self.sums, eps=EPS, ahead=ahead), self.inverse
-            )
+            result = matmul(self.raw, given, cut, epilogue, out=out, sums=self.sums, eps=EPS, ahead=ahead)
+            return as_input(result, result.dtype, self.inverse)
         if isinstance(weight, ScaledMatrix):
             return matmul_fp8(x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
-        return as_input(matmul(x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
+        result = matmul(x, weight, cut, epilogue, self.bias, out, ahead=ahead)
+        return as_input(result, result.dtype, self.inverse)
 
     def _added(self, cut: Chosen) -> bool:
         one = self.operation

@@ -124,3 +124,9 @@ __device__ __forceinline__ u32 pack_e4m3(float low, float high) {  // saturates;
     asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(high), "f"(low));
     return both;
 }
+__device__ __forceinline__ u32 to_int8(float x) {  // saturates at 127 and -127; of NaN comes 0
+    int whole;
+    asm("cvt.rni.sat.s8.f32 %0, %1;" : "=r"(whole) : "f"(x < -127.0f ? -127.0f : x));
+    return whole & 0xff;
+}
+__device__ __forceinline__ u32 pack_int8(float low, float high) { return to_int8(low) | to_int8(high) << 8; }

@@ -73,7 +73,10 @@ def source(*names: str, generated: str, folder: Path | None = None) -> str:
     )
 
 
-Numbers = Literal["bf16", "e4m3"]
+Numbers = Literal["bf16", "e4m3", "s8"]
+
+
+WHOLE_COLUMNS = (8, 24, *range(16, 257, 16))  # that products of whole numbers may have
 
 
 def wgmma(
@@ -81,13 +84,15 @@ def wgmma(
 ) -> str:
     """A function `name(float (&sums)[columns / 2], a, u64 b, int keep)`: sums (kept or not) += a @ b, asynchronously.
 
-    a is 64 rows of 32 bytes, a descriptor or, `from_registers`, four u32; b `columns` rows of as much, or `across` 16
-    rows of so many numbers of 16 bits. Its operands can't be written generically.
+    Sums of s8 are int. a is 64 rows of 32 bytes, a descriptor or, `from_registers`, four u32; b `columns` rows of as
+    much, or `across` 16 rows of so many numbers of 16 bits. Its operands can't be written generically.
     """
-    assert columns % 8 == 0 and columns <= 256
+    assert columns % 8 == 0 and columns <= 256 and (numbers != "s8" or columns in WHOLE_COLUMNS)
     count = columns // 2
     registers = ", ".join(f"%{i}" for i in range(count))
-    outputs = ", ".join(f'"+f"(sums[{i}])' for i in range(count))
+    whole = numbers == "s8"
+    kind = "int" if whole else "float"
+    outputs = ", ".join(f'"+{"r" if whole else "f"}"(sums[{i}])' for i in range(count))
     if from_registers:
         parameters = "u32 a0, u32 a1, u32 a2, u32 a3"
         inputs = ", ".join(f'"r"(a{i})' for i in range(4))
@@ -95,13 +100,14 @@ def wgmma(
     else:
         parameters, inputs, a = "u64 a", '"l"(a)', f"%{count}"
     b = count + (4 if from_registers else 1)
-    form = f"k{32 if numbers == 'e4m3' else 16}.f32.{numbers}.{numbers}"
-    transposed = "" if numbers == "e4m3" else ("" if from_registers else ", 0") + f", {int(across)}"
+    form = f"k{16 if numbers == 'bf16' else 32}.{'s32' if whole else 'f32'}.{numbers}.{numbers}"
+    transposed = ("" if from_registers else ", 0") + f", {int(across)}" if numbers == "bf16" else ""
+    signs = "" if whole else ", 1, 1"
     return (
-        f"__device__ __forceinline__ void {name}(float (&sums)[{count}], {parameters}, u64 b, int keep) {{\n"
+        f"__device__ __forceinline__ void {name}({kind} (&sums)[{count}], {parameters}, u64 b, int keep) {{\n"
         f'asm volatile("{{ .reg .pred p; setp.ne.b32 p, %{b + 1}, 0;\\n"\n'
         f'"wgmma.mma_async.sync.aligned.m64n{columns}{form} {{{registers}}}, {a}, %{b},"\n'
-        f'" p, 1, 1{transposed}; }}" : {outputs} : {inputs}, "l"(b), "r"(keep)); }}'
+        f'" p{signs}{transposed}; }}" : {outputs} : {inputs}, "l"(b), "r"(keep)); }}'
     )
 
 

@@ -147,7 +147,7 @@ class FusedVision:
         folded = self._fold(weight, bias, norm)
         x, sums = pending.run(x, folded.data)
         result = matmul(x, folded, folding, epilogue, out=out, sums=sums, eps=eps, ahead=ahead)
-        return VisionStream(x, sums=sums), as_input(result, inverse)
+        return VisionStream(x, sums=sums), as_input(result, result.dtype, inverse)
 
     def _linear(
         self,

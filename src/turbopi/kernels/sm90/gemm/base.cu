@@ -16,6 +16,9 @@
 // of K each (+ bias in the first) as out[split, M, N], 5 the same in bfloat16, without a bias, 6 + bias, rounded and added
 // to what is in `out`, the residual stream: the L2 cache adds, so nobody waits for what was there.
 //
+// TP_INT8, beside TP_FP8: both are whole numbers instead, their sums exact. TP_MARKS: where the result can't hold that it
+// isn't finite, the row's first number in `marked`, rows of `mark_pitch` bfloat16 numbers, becomes NaN.
+//
 // TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
 // sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: without TP_APART they go
 // where operands were.
@@ -39,7 +42,14 @@ constexpr bool GATHER = TP_GATHER;
 #define TP_ROW_PARTS (TP_NORMED + TP_COPY)
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
-constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8, MARKS = TP_MARKS;
+static_assert(!TP_INT8 || (TP_FP8 && !TP_PROMOTE && !TP_OVERLAP && !TP_NORMED && !TP_COPY && !TP_RESIDUAL), "INT8");
+#define INFINITE __uint_as_float(0x7f800000)
+#if TP_INT8
+typedef int Sum;
+#else
+typedef float Sum;
+#endif
 static_assert(!(TP_COPY && TP_NORMED) && !(TP_COPY && TP_OUT_FP8), "copies leave beside a bfloat16 stream");
 #if TP_OUT_FP8
 typedef unsigned char Element;
@@ -75,7 +85,11 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
             "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
             ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
 }
-// Generated: mma(float (&sums)[BN / 2], u64 a, u64 b, int keep), and the kernel's parameters.
+// Generated: mma(Sum (&sums)[BN / 2], u64 a, u64 b, int keep), and the kernel's parameters.
+
+__device__ __forceinline__ u32 pack_eight_bits(float low, float high) {
+    return TP_INT8 ? pack_int8(low, high) : pack_e4m3(low, high);
+}
 
 __device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at most: less than rounding is
     float t;

@@ -22,7 +22,7 @@ SPLIT = ("partial", "parts")
 DEPTH = 64  # of a step along the inner axis
 STEP_BYTES = 128  # the same, in either precision
 HALF_SHARED_BYTES = 113 * 1024  # of one of two CTAs on a multiprocessor
-BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # fp8.py has the others
+BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0, "TP_INT8": 0, "TP_MARKS": 0}  # fp8.py has the others
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def launch(
     kernel.launch_dependent(blocks, given | {"ahead": place, "ahead_bytes": share})
 
 
-def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Parameters:
+def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool, marks: bool = False) -> Parameters:
     """What kernel.cu's kernel takes in these forms."""
     rows = (
         Parameter("const float2*", "sums_in", "[parts][M]: the sum and the sum of squares of a row"),
@@ -258,6 +258,7 @@ def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Para
             *((Parameter("const float*", "sums_of_w"), Parameter("const float*", "offset")) if normed else ()),
             *((Parameter("const float2*", "norm_scale"), Parameter("const float2*", "norm_shift")) if copied else ()),
             *((Parameter("unsigned char*", "copy"), Parameter("float2*", "plain_sums")) if copied else ()),
+            *((Parameter("u16*", "marked"), Parameter("int", "mark_pitch")) if marks else ()),
             *(Parameter("int", name) for name in ("M", "N", "k_blocks", "m_groups", "n_groups")),
             Parameter("const char*", "ahead"),
             Parameter("u32", "ahead_bytes"),
@@ -364,14 +365,19 @@ def _kernel(
 
 def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile.columns, takes, fp8=bool(sizes["TP_FP8"])), "sm_90a", sizes)
+        cubin = compile_cubin(source(tile.columns, takes, numbers_of(sizes)), "sm_90a", sizes)
         threads, shared = 128 * (tile.warpgroups + 1), sizes["TP_SHARED_BYTES"]
         return DependentKernel(cubin, "gemm", takes, shared_bytes=shared, threads=threads, cluster=tile.cluster)
 
 
-def source(columns: int, takes: Parameters, *, fp8: bool) -> str:
+def numbers_of(sizes: dict[str, int]) -> instructions.Numbers:
+    """What kernel.cu multiplies, compiled with these constants."""
+    return "s8" if sizes["TP_INT8"] else "e4m3" if sizes["TP_FP8"] else "bf16"
+
+
+def source(columns: int, takes: Parameters, numbers: instructions.Numbers) -> str:
     """base.cu, overlap.cu and kernel.cu with the instruction for tiles of that many columns."""
-    mma = instructions.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
+    mma = instructions.wgmma("mma", columns, numbers=numbers)
     generated = f"{mma}\n#define GEMM_PARAMETERS {takes.declarations}\n"
     return instructions.source("gemm/base.cu", "gemm/overlap.cu", "gemm/kernel.cu", generated=generated)
 

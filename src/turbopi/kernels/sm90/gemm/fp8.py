@@ -1,7 +1,8 @@
-"""Matrix products of E4M3 numbers, for compute capability 9.0: kernel.cu compiled for them.
+"""Matrix products of numbers of eight bits, for compute capability 9.0: kernel.cu compiled for E4M3 or int8.
 
-Twins: `kernels.plain`' products with a `ScaledMatrix` of E4M3. The results are bfloat16, E4M3 for a product that reads
-them next (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
+Twins: `kernels.plain`' products with a `ScaledMatrix`. The results are bfloat16, of the same numbers for a product that
+reads them next (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up. Sums of
+int8 are whole and exact, so nothing of them is promoted.
 """
 
 from dataclasses import dataclass, replace
@@ -31,8 +32,8 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     tile_constants,
 )
 from turbopi.kernels.sm90.gemm.tiles import TILES_FP8
-from turbopi.kernels.sm90.instructions import DependentKernel
-from turbopi.quantization.fp8 import ALIGNMENT, E4M3, ScaledMatrix
+from turbopi.kernels.sm90.instructions import WHOLE_COLUMNS, DependentKernel
+from turbopi.quantization.fp8 import ALIGNMENT, ScaledMatrix
 
 DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
@@ -82,10 +83,13 @@ def matmul_fp8(
     sums_out: Sums | None = None,
     sums: Sums | None = None,
     copy: Copy | None = None,
+    stream: Tensor | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
-    """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
-    "partial" -> float32, "parts" -> bfloat16[splits, M, N]. "added" as of `bf16.matmul`.
+    """a (e4m3|int8)[M, K] @ weightᵀ of the same numbers with the epilogue -> bfloat16[M, N], or with `inverse` of these
+    numbers, round(… * inverse); "partial" -> float32, "parts" -> bfloat16[splits, M, N]. "added" as of `bf16.matmul`.
+
+    int8's damage is marked in `stream` [M, width], bfloat16: see `quantization.int8`.
 
     With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
     `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
@@ -99,22 +103,25 @@ def matmul_fp8(
     assert copy is None or (residual is not None and sums is None and inverse is None)
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
-    assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
+    assert a.dtype == weight.numbers and a.is_contiguous() and weight.data.is_contiguous()
     assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
-    promote = promotion(tile, k) if promote is None else promote
+    whole = weight.numbers == torch.int8
+    promote = 0 if whole else promotion(tile, k) if promote is None else promote
     tile = fitted(tile, groups, -(-k // DEPTH), a.device)
     partial = epilogue == "partial"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
     assert out is not None or epilogue != "added"
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
-        out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
-    assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
+        out = torch.empty(shape, dtype=_result_dtype(partial, inverse, a.dtype), device=a.device)
+    assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse, a.dtype)
+    assert stream is None or (whole and inverse is not None and stream.dtype == torch.bfloat16 and len(stream) == m)
     assert not (promote and tile.overlap), "no registers are left for sums that are promoted"
     normed = 0 if sums is None else sums.count
     copied = copied_parts(copy, m, n)
-    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)
+    kind = Eight(whole, inverse is not None, promote, stream is not None)
+    kernel = _kernel(tile, epilogue, kind, residual is not None, normed, copied, a.device)
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -123,45 +130,50 @@ def matmul_fp8(
         "inverse": 1.0 if inverse is None else inverse,
         **({} if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
         **copy_arguments(copy, n),
+        **({} if stream is None else {"marked": stream.data_ptr(), "mark_pitch": stream.stride(0)}),
         **size_arguments(m, n, -(-k // DEPTH), groups),
     }
     launch(kernel, tile, groups, given, ahead)
     return out
 
 
-def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
-    return torch.float32 if partial else torch.bfloat16 if inverse is None else E4M3
+def _result_dtype(partial: bool, inverse: float | None, numbers: torch.dtype) -> torch.dtype:
+    return torch.float32 if partial else torch.bfloat16 if inverse is None else numbers
+
+
+@dataclass(frozen=True)
+class Eight:
+    """What kernel.cu is compiled for, of its forms for eight bits."""
+
+    whole: bool = False  # int8, else E4M3
+    out: bool = False  # the result has eight bits, too
+    promote: int = 0
+    marks: bool = False  # int8's damage
 
 
 def constants(
-    tile: Tile,
-    epilogue: Epilogue,
-    out_fp8: bool,
-    promote: int,
-    residual: bool = False,
-    normed: int = 0,
-    copied: int = 0,
+    tile: Tile, epilogue: Epilogue, kind: Eight, residual: bool = False, normed: int = 0, copied: int = 0
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
-    if out_fp8:
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(kind.out), "TP_PROMOTE": kind.promote, "TP_NORMED": normed, "TP_COPY": copied}
+    own |= {"TP_INT8": int(kind.whole), "TP_MARKS": int(kind.marks)}
+    if kind.out:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
-    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=promote > 0) | own
+    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=kind.promote > 0) | own
 
 
 @MadeOnce
 def _kernel(
     tile: Tile,
     epilogue: Epilogue,
-    out_fp8: bool,
-    promote: int,
+    kind: Eight,
     residual: bool,
     normed: int,
     copied: int,
     device: torch.device,
 ) -> DependentKernel:
-    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0)
-    return build(takes, constants(tile, epilogue, out_fp8, promote, residual, normed, copied), tile, device)
+    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0, marks=kind.marks)
+    return build(takes, constants(tile, epilogue, kind, residual, normed, copied), tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------
@@ -202,17 +214,30 @@ def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> fl
 
 
 @cache
-def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
-    """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
+def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int, whole: bool = False) -> Tile:
+    """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost.
+
+    whole: of int8, whose sums aren't promoted; E4M3's measured tile if it multiplies int8, too
+    """
     m = -(-m // 64) * 64
     measured = TILES_FP8.get((m, n, k))
     if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
-        return measured
+        if not whole:
+            return measured
+        if takes_whole(measured := replace(measured, overlap=False)):
+            return measured
     fitting = [tile for tile in candidates(epilogue, m) if tile.splits <= -(-k // DEPTH)]
-    if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
+    if whole:
+        fitting = [tile for tile in fitting if takes_whole(tile)]
+    elif -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
         fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]
     best = min(fitting, key=lambda tile: cost(tile, m, n, k, epilogue, sms))
     return replace(best, cluster_n=2) if epilogue == "geglu" else best
+
+
+def takes_whole(tile: Tile) -> bool:
+    """Whether int8 may be multiplied so: there are widths that its instruction hasn't."""
+    return tile.columns in WHOLE_COLUMNS and not tile.overlap
 
 
 def _short(tile: Tile, k: int) -> bool:

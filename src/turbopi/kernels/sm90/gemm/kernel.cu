@@ -96,7 +96,7 @@ gemm(GEMM_PARAMETERS) {
         const u32 a_lower = lower_half(base + group * 8192), b_lower = lower_half(base + A_BYTES);
         int slot = 0, last = 0;
         u32 parity = 0;
-        auto multiply = [&](float(&to)[BN / 2], bool keep) {  // one step, and no more than it is still going on then
+        auto multiply = [&](Sum(&to)[BN / 2], bool keep) {  // one step, and no more than it is still going on then
             barrier_wait(full + 8 * slot, parity);
             const u32 a = a_lower + slot * (STAGE_BYTES / 16), b = b_lower + slot * (STAGE_BYTES / 16);
             begin_products();
@@ -243,13 +243,23 @@ gemm(GEMM_PARAMETERS) {
             }
             prepare();
 #else
+#if TP_INT8
+            int products[BN / 2];
+#else
+            float(&products)[BN / 2] = sums;
+#endif
             // The first products don't wait for what only the epilogue needs.
-            multiply(sums, false), advance();
-            if (t.k + 1 < t.k_end) multiply(sums, true), release(last), advance();
+            multiply(products, false), advance();
+            if (t.k + 1 < t.k_end) multiply(products, true), release(last), advance();
             prepare();
-            for (int k = t.k + 2; k < t.k_end; ++k) multiply(sums, true), release(last), advance();
+            for (int k = t.k + 2; k < t.k_end; ++k) multiply(products, true), release(last), advance();
             await_products<0>();
             release(last);
+#if TP_INT8
+#pragma unroll
+            for (int i = 0; i < BN / 2; ++i)  // volatile: not before they are done
+                asm volatile("cvt.rn.f32.s32 %0, %1;" : "=f"(sums[i]) : "r"(products[i]));
+#endif
 #endif
 #if TP_FP8 && !TP_NORMED
 #pragma unroll
@@ -320,6 +330,7 @@ gemm(GEMM_PARAMETERS) {
 #elif TP_RESIDUAL
                     float sum = 0.0f, squares = 0.0f;  // of the row's results
 #endif
+                    [[maybe_unused]] bool damaged = false;
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
 #if TP_RESIDUAL && !TP_FP8
@@ -345,12 +356,16 @@ gemm(GEMM_PARAMETERS) {
                         return both;
 #endif
 #if TP_FP8
-                        if (OUT_FP8 && EPILOGUE == 3) return pack_e4m3(x, y);
-                        if (OUT_FP8) return pack_e4m3(x * inverse, y * inverse);
+                        if (OUT_FP8 && EPILOGUE != 3) x *= inverse, y *= inverse;
+                        if (MARKS) damaged |= j < blocks && !(fabsf(x) < INFINITE && fabsf(y) < INFINITE);
+                        if (OUT_FP8) return pack_eight_bits(x, y);
 #endif
                         return pack(x, y);
                     };
                     store_row(settled((Element*)out + begin + t.n), in_row[half], t.split, lane, value);
+#if TP_MARKS
+                    if (damaged && row + half * 8 < M) marked[(size_t)(row + half * 8) * mark_pitch] = 0x7fff;
+#endif
 #if TP_COPY
                     auto copied = [&](int j) { return copies[j]; };
                     store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, copied);

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from turbopi.kernels.plain import as_input
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
@@ -24,7 +25,7 @@ from turbopi.kernels.sm90.gemm.tiles import (
 )
 from turbopi.kernels.sm90.instructions import multiprocessors
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Knobs, TileTable
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix
 
 # Of fewer rows it wasn't measured; there the norm behind is bound by its launch.
 ADDING_ROWS = 1024
@@ -45,15 +46,19 @@ def chosen(tiles: TileTable, operation: Operation, m: int, n: int, k: int) -> Ch
     return (RESIDUAL_TILES if operation == "residual" else VISION_TILES).get((m, n, k))
 
 
-def chosen_fp8(tiles: TileTable, operation: Operation, m: int, n: int, k: int, sms: int) -> Tile | None:
-    """The tile of a product of E4M3 numbers; None: "residual" isn't made that way."""
-    knobs = tiles.find("hopper", operation, "fp8", m, n, k)
+def chosen_fp8(
+    tiles: TileTable, operation: Operation, m: int, n: int, k: int, sms: int, whole: bool = False
+) -> Tile | None:
+    """The tile of a product of E4M3 numbers; None: "residual" isn't made that way. `whole`: of int8, which no tiles are
+    measured for.
+    """
+    knobs = None if whole else tiles.find("hopper", operation, "fp8", m, n, k)
     if knobs is not None:
         tile = from_knobs(knobs)
         return tile if isinstance(tile, Tile) else None
     if operation == "residual":
-        return RESIDUAL_TILES_FP8.get((m, n, k))
-    return best_tile(m, n, k, operation, sms)
+        return None if whole else RESIDUAL_TILES_FP8.get((m, n, k))
+    return best_tile(m, n, k, operation, sms, whole)
 
 
 def from_knobs(knobs: Knobs) -> Chosen:
@@ -131,7 +136,9 @@ def added(
     (rows, inner), columns = x.shape, weight.shape[0]
     operation: Operation = "parts" if bias is None else "partial"
     if isinstance(weight, ScaledMatrix):
-        cut: Chosen = chosen_fp8(tiles, operation, rows, columns, inner, multiprocessors(x.device))
+        cut: Chosen = chosen_fp8(
+            tiles, operation, rows, columns, inner, multiprocessors(x.device), weight.numbers == torch.int8
+        )
     else:
         cut = chosen(tiles, operation, rows, columns, inner)
     if isinstance(cut, Tile) and cut.splits == 1:
@@ -157,27 +164,31 @@ def tuned_linear_gelu(
     inverse: float | None = None,
     ahead: Tensor | None = None,
     *,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if isinstance(weight, ScaledMatrix):
-        return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead, tiles=tiles)
+        return _fp8(x, weight, "gelu", bias, inverse=inverse, stream=stream, ahead=ahead, tiles=tiles)
     tile = bf16_tile(tiles, "gelu", x, weight)
     result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias, ahead=ahead)
-    return as_input(result, inverse)
+    return as_input(result, x.dtype, inverse, numbers, stream)
 
 
 def tuned_linear_geglu(
-    x: Tensor, gate_up: Matrix, inverse: float | None = None, *, tiles: TileTable = NO_TILES
+    x: Tensor,
+    gate_up: Matrix,
+    inverse: float | None = None,
+    *,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if isinstance(gate_up, ScaledMatrix):
-        return _fp8(x, gate_up, "geglu", inverse=inverse, tiles=tiles)
+        return _fp8(x, gate_up, "geglu", inverse=inverse, stream=stream, tiles=tiles)
     tile = chosen_geglu(tiles, x.shape[0], gate_up.shape[0] // 2, x.shape[1], multiprocessors(x.device))
-    return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
-
-
-def as_input(x: Tensor, inverse: float | None) -> Tensor:
-    """x, rounded to E4M3 in a pass of its own where only the product behind this one is in E4M3."""
-    return x if inverse is None else to_e4m3(x, inverse)
+    result = linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu")
+    return as_input(result, x.dtype, inverse, numbers, stream)
 
 
 def _fp8(
@@ -187,16 +198,18 @@ def _fp8(
     bias: Tensor | None = None,
     out: Tensor | None = None,
     inverse: float | None = None,
+    stream: Tensor | None = None,
     ahead: Tensor | None = None,
     *,
     tiles: TileTable,
 ) -> Tensor:
+    whole = weight.numbers == torch.int8
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
-    tile = chosen_fp8(tiles, epilogue, x.shape[0], n, weight.shape[1], multiprocessors(x.device))
+    tile = chosen_fp8(tiles, epilogue, x.shape[0], n, weight.shape[1], multiprocessors(x.device), whole)
     assert tile is not None, "the library has no such product"
     if epilogue in SPLIT and (tile.splits == 1 or tile.gather):
         epilogue = "bias"
-    return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, ahead=ahead)
+    return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, stream=stream, ahead=ahead)
 
 
 def chosen_geglu(tiles: TileTable, rows: int, hidden: int, inner: int, sms: int) -> Tile | None:
