@@ -149,7 +149,7 @@ def file_of(device: torch.device, precision: Precision, model: Network) -> Path:
 def about(device: torch.device, precision: Precision, model: Network) -> dict[str, Any]:
     gpu = torch.cuda.get_device_properties(device)
     forced = os.environ.get("TURBOPI_KERNELS") == "portable"
-    on_hopper = (gpu.major, gpu.minor) == (9, 0) and not forced and precision != "int8"
+    on_hopper = (gpu.major, gpu.minor) == (9, 0) and not forced
     return {
         "gpu": gpu.name,
         "compute_capability": f"{gpu.major}.{gpu.minor}",
