@@ -170,7 +170,7 @@ def test_loads_fill_a_tile_and_its_stages_fit_into_shared_memory(
     assert a.strides == w.strides == (k,)
     assert a.box == (inner, tile.rows // tile.cluster_n), "the CTAs of a row share its loads"
     assert w.box == (inner, tile.columns // halves // tile.cluster_m), "gate and up come apart"
-    sizes = gemm_fp8.constants(tile, epilogue, gemm_fp8.Eight()) if fp8 else gemm.constants(tile, epilogue)
+    sizes = gemm_fp8.constants(tile, epilogue, False, 0) if fp8 else gemm.constants(tile, epilogue)
     stages = sizes["TP_STAGES"] * (tile.rows + tile.columns) * 128
     barriers = 16 * sizes["TP_STAGES"] + 16
     factors = 8 * tile.warpgroups * tile.columns if fp8 else 0
@@ -188,13 +188,13 @@ def test_one_tile_of_few_steps_leaves_the_rest_of_shared_memory_to_the_next_kern
     assert gemm.fitted(Tile(2, 64), (1, 16), 4, GPU) == Tile(2, 64), "no CTA fits beside two warpgroups' registers"
     gathered = Tile(1, 64, splits=4, gather=True)
     assert gemm.fitted(gathered, (1, 4), 16, GPU) == gathered, "sums are gathered where operands were"
-    needed = [gemm_fp8.constants(one, "parts", gemm_fp8.Eight())["TP_SHARED_BYTES"] for one in (tile, alone)]
+    needed = [gemm_fp8.constants(one, "parts", False, 0)["TP_SHARED_BYTES"] for one in (tile, alone)]
     assert needed[1] < needed[0] <= instructions.SHARED_BYTES
     assert (
         gemm.constants(tile, "parts")["TP_LEAVES_ROOM"] == 1
         and gemm.constants(Tile(2, 64), "parts")["TP_LEAVES_ROOM"] == 0
     )
-    assert gemm_fp8.constants(tile, "bias", gemm_fp8.Eight(promote=4), residual=True)["TP_LEAVES_ROOM"] == 0, (
+    assert gemm_fp8.constants(tile, "bias", False, 4, residual=True)["TP_LEAVES_ROOM"] == 0, (
         "sums twice beside a stream"
     )
 

@@ -53,14 +53,13 @@ def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
     for epilogue, parts, copied in itertools.product(epilogues(one, tile), norms, copies):
         of_norm = replace_tile(tile, overlap=False) if parts else tile
         takes = bf16.parameters(fp8=in_fp8, residual=residual, normed=parts > 0, copied=copied > 0)
-        source = bf16.source(tile.columns, takes, "e4m3" if in_fp8 else "bf16")
+        source = bf16.source(tile.columns, takes, fp8=in_fp8)
         if not in_fp8:
             yield source, bf16.constants(of_norm, epilogue, residual, parts, copied)
             continue
         promote = fp8.promotion(of_norm, one.inner)
         for out_fp8 in (False, True) if one.operation in ("gelu", "geglu") else (False,):
-            kind = fp8.Eight(out=out_fp8, promote=promote)
-            yield source, fp8.constants(of_norm, epilogue, kind, residual, parts, copied)
+            yield source, fp8.constants(of_norm, epilogue, out_fp8, promote, residual, parts, copied)
 
 
 def epilogues(one: TunedTile, tile: Tile) -> list[Epilogue]:

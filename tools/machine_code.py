@@ -57,15 +57,14 @@ def _denoising(
 
 def _product(tile: Tile, epilogue: Epilogue, residual: bool, folder: Path | None) -> bytes:
     takes = bf16.parameters(fp8=False, residual=residual, normed=False, copied=False)
-    source = bf16.source(tile.columns, takes, "bf16")
+    source = bf16.source(tile.columns, takes, fp8=False)
     return nvrtc.compile_cubin(source, ARCH, bf16.constants(tile, epilogue, residual), folder=folder)
 
 
 def _product_fp8(tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp8: bool, folder: Path | None) -> bytes:
     takes = bf16.parameters(fp8=True, residual=copied > 0, normed=False, copied=copied > 0)
-    kind = fp8.Eight(out=out_fp8, promote=fp8.promotion(tile, inner))
-    sizes = fp8.constants(tile, epilogue, kind, copied > 0, 0, copied)
-    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, "e4m3"), ARCH, sizes, folder=folder)
+    sizes = fp8.constants(tile, epilogue, out_fp8, fp8.promotion(tile, inner), copied > 0, 0, copied)
+    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True), ARCH, sizes, folder=folder)
 
 
 def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, *, packed: bool = False) -> bytes:

@@ -42,7 +42,7 @@ constexpr bool GATHER = TP_GATHER;
 #define TP_ROW_PARTS (TP_NORMED + TP_COPY)
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
-constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8, MARKS = TP_MARKS;
+constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
 static_assert(!TP_INT8 || (TP_FP8 && !TP_PROMOTE && !TP_OVERLAP && !TP_NORMED && !TP_COPY && !TP_RESIDUAL), "INT8");
 #define INFINITE __uint_as_float(0x7f800000)
 #if TP_INT8

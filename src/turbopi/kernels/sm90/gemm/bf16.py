@@ -365,19 +365,16 @@ def _kernel(
 
 def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile.columns, takes, numbers_of(sizes)), "sm_90a", sizes)
+        cubin = compile_cubin(
+            source(tile.columns, takes, fp8=bool(sizes["TP_FP8"]), whole=bool(sizes["TP_INT8"])), "sm_90a", sizes
+        )
         threads, shared = 128 * (tile.warpgroups + 1), sizes["TP_SHARED_BYTES"]
         return DependentKernel(cubin, "gemm", takes, shared_bytes=shared, threads=threads, cluster=tile.cluster)
 
 
-def numbers_of(sizes: dict[str, int]) -> instructions.Numbers:
-    """What kernel.cu multiplies, compiled with these constants."""
-    return "s8" if sizes["TP_INT8"] else "e4m3" if sizes["TP_FP8"] else "bf16"
-
-
-def source(columns: int, takes: Parameters, numbers: instructions.Numbers) -> str:
-    """base.cu, overlap.cu and kernel.cu with the instruction for tiles of that many columns."""
-    mma = instructions.wgmma("mma", columns, numbers=numbers)
+def source(columns: int, takes: Parameters, *, fp8: bool, whole: bool = False) -> str:
+    """base.cu, overlap.cu and kernel.cu with the instruction for tiles of that many columns. whole: of int8."""
+    mma = instructions.wgmma("mma", columns, numbers="s8" if whole else "e4m3" if fp8 else "bf16")
     generated = f"{mma}\n#define GEMM_PARAMETERS {takes.declarations}\n"
     return instructions.source("gemm/base.cu", "gemm/overlap.cu", "gemm/kernel.cu", generated=generated)
 

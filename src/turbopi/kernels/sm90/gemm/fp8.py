@@ -7,6 +7,7 @@ int8 are whole and exact, so nothing of them is promoted.
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -120,8 +121,8 @@ def matmul_fp8(
     assert not (promote and tile.overlap), "no registers are left for sums that are promoted"
     normed = 0 if sums is None else sums.count
     copied = copied_parts(copy, m, n)
-    kind = Eight(whole, inverse is not None, promote, stream is not None)
-    kernel = _kernel(tile, epilogue, kind, residual is not None, normed, copied, a.device)
+    form = inverse is not None, promote, residual is not None, normed, copied, whole, stream is not None
+    kernel = _kernel(tile, epilogue, form, a.device)
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -141,39 +142,37 @@ def _result_dtype(partial: bool, inverse: float | None, numbers: torch.dtype) ->
     return torch.float32 if partial else torch.bfloat16 if inverse is None else numbers
 
 
-@dataclass(frozen=True)
-class Eight:
-    """What kernel.cu is compiled for, of its forms for eight bits."""
-
-    whole: bool = False  # int8, else E4M3
-    out: bool = False  # the result has eight bits, too
-    promote: int = 0
-    marks: bool = False  # int8's damage
-
-
 def constants(
-    tile: Tile, epilogue: Epilogue, kind: Eight, residual: bool = False, normed: int = 0, copied: int = 0
+    tile: Tile,
+    epilogue: Epilogue,
+    out_fp8: bool,
+    promote: int,
+    residual: bool = False,
+    normed: int = 0,
+    copied: int = 0,
+    whole: bool = False,
+    marks: bool = False,
 ) -> dict[str, int]:
-    """What kernel.cu is compiled with."""
-    own = {"TP_FP8": 1, "TP_OUT_FP8": int(kind.out), "TP_PROMOTE": kind.promote, "TP_NORMED": normed, "TP_COPY": copied}
-    own |= {"TP_INT8": int(kind.whole), "TP_MARKS": int(kind.marks)}
-    if kind.out:
+    """What kernel.cu is compiled with. whole: for int8; marks: its damage."""
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
+    own |= {"TP_INT8": int(whole), "TP_MARKS": int(marks)}
+    if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
-    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=kind.promote > 0) | own
+    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=promote > 0) | own
 
 
 @MadeOnce
-def _kernel(
-    tile: Tile,
-    epilogue: Epilogue,
-    kind: Eight,
-    residual: bool,
-    normed: int,
-    copied: int,
-    device: torch.device,
-) -> DependentKernel:
-    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0, marks=kind.marks)
-    return build(takes, constants(tile, epilogue, kind, residual, normed, copied), tile, device)
+def _kernel(tile: Tile, epilogue: Epilogue, form: Any, device: torch.device) -> DependentKernel:
+    """form: what `constants` takes behind these"""
+    sizes = constants(tile, epilogue, *form)
+    takes = parameters(
+        fp8=True,
+        residual=sizes["TP_RESIDUAL"] > 0,
+        normed=sizes["TP_NORMED"] > 0,
+        copied=sizes["TP_COPY"] > 0,
+        marks=sizes["TP_MARKS"] > 0,
+    )
+    return build(takes, sizes, tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------

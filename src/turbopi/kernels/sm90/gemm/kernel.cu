@@ -246,7 +246,7 @@ gemm(GEMM_PARAMETERS) {
 #if TP_INT8
             int products[BN / 2];
 #else
-            float(&products)[BN / 2] = sums;
+#define products sums
 #endif
             // The first products don't wait for what only the epilogue needs.
             multiply(products, false), advance();
@@ -330,7 +330,9 @@ gemm(GEMM_PARAMETERS) {
 #elif TP_RESIDUAL
                     float sum = 0.0f, squares = 0.0f;  // of the row's results
 #endif
-                    [[maybe_unused]] bool damaged = false;
+#if TP_MARKS
+                    bool damaged = false;
+#endif
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
 #if TP_RESIDUAL && !TP_FP8
@@ -355,10 +357,12 @@ gemm(GEMM_PARAMETERS) {
                         sum += x + y, squares = fmaf(x, x, fmaf(y, y, squares));
                         return both;
 #endif
+#if TP_MARKS
+                        damaged |= j < blocks && !(fabsf(x) < INFINITE && fabsf(y) < INFINITE);
+#endif
 #if TP_FP8
-                        if (OUT_FP8 && EPILOGUE != 3) x *= inverse, y *= inverse;
-                        if (MARKS) damaged |= j < blocks && !(fabsf(x) < INFINITE && fabsf(y) < INFINITE);
-                        if (OUT_FP8) return pack_eight_bits(x, y);
+                        if (OUT_FP8 && EPILOGUE == 3) return pack_eight_bits(x, y);
+                        if (OUT_FP8) return pack_eight_bits(x * inverse, y * inverse);
 #endif
                         return pack(x, y);
                     };
