@@ -83,6 +83,8 @@ class Vision:
     def _embed(self, images: Tensor) -> Tensor:
         """[V, patches, W]"""
         p, (count, side) = self.model.config.vision.patch_size, images.shape[:2]
+        if rest := side % p:  # pixels beside whole patches
+            images = images[:, : side - rest, : side - rest].contiguous()
         pixels = normalize_images(images).view(count, side // p, p, side // p, p, 3).permute(0, 1, 3, 5, 2, 4)
         patches = self.projector.new_empty(pixels.shape).copy_(pixels)  # both in one kernel
         return F.linear(patches.view(count, -1, 3 * p * p), *self.patch) + self.positions
