@@ -100,14 +100,8 @@ using OutShape = Shape<D, HEADS * HD, TP_RANGES>;
 using GateUpShape = Shape<2 * F, D, TP_WIDE_RANGES>;
 using DownShape = Shape<D, F, TP_RANGES>;
 using MixShape = Shape<D, D, TP_RANGES>;
-// Across at once: a block has a head for up to 8 tokens. Keys and values are on their way beside the weights, so that other
-// GPUs than 9.0 would spill more with all of these
-#if __CUDA_ARCH__ == 900
-constexpr int QUERIES_IN_FLIGHT = TP_WEIGHTS_IN_FLIGHT;
-#else
-constexpr int QUERIES_IN_FLIGHT = TP_WEIGHTS_IN_FLIGHT / 2;
-#endif
-using QueriesShape = Shape<HEADS * HD, D, (T + 7) / 8, HEADS, QUERIES_IN_FLIGHT>;
+// Across at once: a block has a head for up to 8 tokens. Keys and values are on their way beside the weights: half as many
+using QueriesShape = Shape<HEADS * HD, D, (T + 7) / 8, HEADS, TP_WEIGHTS_IN_FLIGHT / 2>;
 using EmbedShape = Shape<D, F>;  // how a step's first phase shares out columns
 constexpr long long QKV_AT = 0, OUT_AT = QkvShape::BYTES, GATE_UP_AT = OUT_AT + OutShape::BYTES;
 constexpr long long DOWN_AT = GATE_UP_AT + GateUpShape::BYTES, LAYER_BYTES = DOWN_AT + DownShape::BYTES;
