@@ -158,7 +158,7 @@ class PackedExpert:
         if reason is not None:
             raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
         scales, of_inputs = [], []
-        depth, orders, weights = config.expert.depth, _orders(config.expert), torch.empty(0)
+        depth, orders, weights = config.expert.depth, list(_orders(config.expert)), torch.empty(0)
         for i, layer in zip(range(depth), layers, strict=True):
             if i == 0:
                 device = device or layer.qkv.device
