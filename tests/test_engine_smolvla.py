@@ -148,12 +148,12 @@ def test_read_to_its_places_it_is_packed_with_the_same_bits_and_moves_nothing() 
     places = DEVICE, Placement(config, DEVICE, bfloat16)
     plain, placed = (SmolVLAModel.from_state(config, checkpoint.load(to, "bf16").state) for to in places)
     before = {name: weight.data_ptr() for name, weight in placed.named_parameters()}
-    kept = [(one.vision.layers[0].mlp.fc1.weight.dtype, one.projector.weight.dtype) for one in (plain, placed)]
-    assert kept == [(torch.float32, torch.float32), (bfloat16, bfloat16)]
+    kept = [{weight.dtype for weight in (*one.vision.parameters(), one.projector.weight)} for one in (plain, placed)]
+    assert kept == [{torch.float32}, {bfloat16}]
     own = [layer.self_attn.k_proj.weight.dtype for layer in placed.expert.layers]
     assert own == [bfloat16, torch.float32, bfloat16, torch.float32]  # as LeRobot's layers across have them
 
-    def packed(made: SmolVLAModel) -> list[Tensor]:
+    def packed(made: SmolVLAModel) -> list[Any]:
         vision, prefix = Vision.pack(made, PLAIN, bfloat16), Prefix.pack(made, PLAIN, bfloat16)
         pairs = [(*one.norm1, *one.qkv, *one.out, *one.norm2, *one.fc1, *one.fc2) for one in vision.layers]
         layers = [(one.qkv, one.out, one.gate_up, one.down, one.norm1, one.norm2) for one in prefix.layers]
