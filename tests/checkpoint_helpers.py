@@ -277,7 +277,7 @@ def lerobot_copy(folder: Path, mode: str = "QUANTILES", **config: Any) -> Path:
 
 
 def lerobot_statistics() -> dict[str, torch.Tensor]:
-    """The statistics of golden pi05 as LeRobot's flat float32 tensors, with made-up min and max."""
+    """The statistics of golden pi05 as LeRobot's flat float32 tensors, with made-up min, max, q10 and q90."""
     content = json.loads((GOLDEN / "pi05" / "torch" / "assets" / LIBERO / "norm_stats.json").read_text())["norm_stats"]
     found = {}
     for ours, theirs in (("state", "observation.state"), ("actions", "action")):
@@ -285,6 +285,8 @@ def lerobot_statistics() -> dict[str, torch.Tensor]:
             found[f"{theirs}.{name}"] = torch.tensor(values, dtype=torch.float32)
         found[f"{theirs}.min"] = found[f"{theirs}.q01"] - 1
         found[f"{theirs}.max"] = found[f"{theirs}.q99"] + 1
+        found[f"{theirs}.q10"] = found[f"{theirs}.q01"] + 0.01
+        found[f"{theirs}.q90"] = found[f"{theirs}.q99"] + 0.01
         found[f"{theirs}.count"] = torch.tensor([1000.0])
     found["observation.images.image.mean"] = torch.zeros(3, 1, 1)
     return found

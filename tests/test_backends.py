@@ -63,6 +63,13 @@ def test_a_backend_is_imported_when_it_is_asked_for() -> None:
         assert spec.module not in loaded
 
 
+@pytest.mark.slow
+def test_pytorchs_compiler_is_imported_by_the_first_call_that_needs_it() -> None:
+    code = "import sys, turbopi.backends.captured as c; c.compile_stage(abs); print('torch._dynamo' in sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert loaded == "False\n"
+
+
 @pytest.mark.parametrize("name", ["cuda_graph", "fused"])
 def test_a_gpu_backend_says_what_it_needs_on_a_cpu(name: str) -> None:
     precision = backends.precisions(name)[0]

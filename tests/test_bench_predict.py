@@ -14,6 +14,7 @@ from turbopi.bench.document import Result, read_benchmark
 from turbopi.bench.gpus import find_gpu, published_gpus
 from turbopi.bench.measured import measured_calls
 from turbopi.bench.predict import (
+    MMA_SYNC,
     MOST_TOKENS,
     PRECISIONS,
     REACHED,
@@ -82,8 +83,8 @@ def test_all_that_was_measured_on_an_h100_is_in_the_range_that_the_h200_predicts
     [
         # delays and ratios by hand, as in docs/dev/performance.md; the host's part, vision, prefix, denoising
         ("bf16", 0.326 + 4.89 + 15.83 + 8.64, 0.326 + 6.51 + 19.94 + 11.58),
-        ("fp8", 0.316 + 2.92 + 8.99 + 5.42, 0.316 + 5.29 + 17.19 + 7.99),
-        ("int8", 0.198 + 1.98 + 5.30 + 5.74, 0.198 + 3.60 + 9.15 + 8.63),
+        ("fp8", 0.316 + 2.34 + 8.55 + 5.42, 0.316 + 4.17 + 13.57 + 7.99),
+        ("int8", 0.198 + 1.65 + 5.20 + 5.74, 0.198 + 2.70 + 7.48 + 8.63),
     ],
 )
 def test_the_call_on_an_rtx_4090_follows_from_figures_that_anybody_can_check(
@@ -108,7 +109,8 @@ def test_predictions_are_narrow() -> None:
         for one in predict(gpu, FULL, Job()):
             for call in one.calls:
                 half = (call.high_ms - call.low_ms) / (call.high_ms + call.low_ms)
-                assert half < (0.2 if one.precision == "bf16" and gpu.key not in ("h100", "b200") else 0.33), call
+                bf16 = one.precision == "bf16" and gpu.key not in ("h100", "b200")
+                assert half < (0.2 if bf16 else 0.3 if gpu.capability[0] in MMA_SYNC else 0.33), call
 
 
 def test_no_measured_call_is_under_its_published_floor() -> None:

@@ -81,7 +81,7 @@ def test_bf16_is_rounded_to_nearest_even(tmp_path: Path) -> None:
         assert torch.equal(converted[name], tensor.bfloat16().float()), name
 
 
-@pytest.mark.parametrize("mode", ["QUANTILES", "MEAN_STD", "MIN_MAX"])
+@pytest.mark.parametrize("mode", ["QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"])
 def test_a_lerobot_checkpoint_keeps_its_way_of_normalising(
     tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,7 +94,7 @@ def test_a_lerobot_checkpoint_keeps_its_way_of_normalising(
     assert again.fingerprint() == source.fingerprint()
     for feature in ("state", "actions"):
         ours, theirs = getattr(again.norm_stats, feature), getattr(source.norm_stats, feature)
-        assert ours.available == theirs.available == ("mean", "std", "q01", "q99", "min", "max")
+        assert ours.available == theirs.available == ("mean", "std", "q01", "q99", "min", "max", "q10", "q90")
         assert all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ours.available)
 
 

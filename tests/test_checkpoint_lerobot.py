@@ -59,6 +59,7 @@ def test_its_weights_are_openpis(tmp_path: Path) -> None:
     ("mode", "expected", "used"),
     [
         ("QUANTILES", "lerobot_quantile", ("q01", "q99")),
+        ("QUANTILE10", "lerobot_quantile10", ("q10", "q90")),
         ("MEAN_STD", "lerobot_zscore", ("mean", "std")),
         ("MIN_MAX", "lerobot_min_max", ("min", "max")),
         ("IDENTITY", "identity", ()),
@@ -204,8 +205,8 @@ def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[s
         (
             PRE,
             "normalizer_processor",
-            {"norm_map": {"STATE": "QUANTILE10"}},
-            "STATE by QUANTILE10; .*LeRobot's own policy",
+            {"norm_map": {"STATE": "QUANTILE5"}},
+            "STATE by QUANTILE5; .*LeRobot's own policy",
         ),
         (POST, "unnormalizer_processor", {"norm_map": {"ACTION": "MEAN_STD"}}, "ACTION by MEAN_STD, but config.json"),
         (

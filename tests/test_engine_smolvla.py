@@ -16,13 +16,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
+from turbopi.checkpoint import random_checkpoint
 from turbopi.config import VisionConfig
-from turbopi.engine.smolvla import Prefix, Vision
+from turbopi.engine.smolvla import Expert, Placement, Prefix, Vision
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.models.observation import Observation
-from turbopi.models.smolvla.config import SmolVLAConfig, TextConfig
+from turbopi.models.smolvla.config import ElementTypes, SmolVLAConfig, TextConfig
+from turbopi.models.smolvla.family import BASE
 from turbopi.models.smolvla.reference import SmolVLAModel
 
 ON_GPU = torch.cuda.is_available()
@@ -31,11 +33,14 @@ DTYPE = torch.bfloat16 if ON_GPU else torch.float32
 pytestmark = gpu_or_interpreter()
 
 
-def model(**sizes: Any) -> SmolVLAModel:
+def config_of(**sizes: Any) -> SmolVLAConfig:
     text = TextConfig(width=64, mlp_dim=48, num_heads=6, num_kv_heads=2, head_dim=16, vocab_size=20, depth=4)
     vision = VisionConfig(width=32, depth=2, mlp_dim=48, num_heads=2, patch_size=4, image_size=16)
-    config = SmolVLAConfig(vision, text, expert_width=48, expert_mlp=80, image_size=16, max_prompt_tokens=7, **sizes)
-    made, generator = SmolVLAModel(config), torch.Generator().manual_seed(1)
+    return SmolVLAConfig(vision, text, expert_width=48, expert_mlp=80, image_size=16, max_prompt_tokens=7, **sizes)
+
+
+def model(**sizes: Any) -> SmolVLAModel:
+    made, generator = SmolVLAModel(config_of(**sizes)), torch.Generator().manual_seed(1)
     for name, parameter in made.named_parameters():
         torch.nn.init.normal_(parameter, std=parameter.shape[-1] ** -0.5, generator=generator)
         if "norm" in name and name.endswith("weight"):
@@ -135,3 +140,26 @@ def test_matrices_side_by_side_are_the_models_own() -> None:
     assert all(torch.equal(weight, before[name]) for name, weight in made.named_parameters())
     storages = {one.data_ptr(): one.nbytes() for one in (weight.untyped_storage() for weight in parameters)}
     assert sum(storages.values()) == sum(weight.nbytes for weight in parameters)
+
+
+def test_read_to_its_places_it_is_packed_with_the_same_bits_and_moves_nothing() -> None:
+    config = config_of(expert_depth=4, element_types=ElementTypes("float32", "bfloat16"))
+    checkpoint, bfloat16 = random_checkpoint(replace(BASE, model=config)), torch.bfloat16
+    places = DEVICE, Placement(config, DEVICE, bfloat16)
+    plain, placed = (SmolVLAModel.from_state(config, checkpoint.load(to, "bf16").state) for to in places)
+    before = {name: weight.data_ptr() for name, weight in placed.named_parameters()}
+    kept = [{weight.dtype for weight in (*one.vision.parameters(), one.projector.weight)} for one in (plain, placed)]
+    assert kept == [{torch.float32}, {bfloat16}]
+    own = [layer.self_attn.k_proj.weight.dtype for layer in placed.expert.layers]
+    assert own == [bfloat16, torch.float32, bfloat16, torch.float32]  # as LeRobot's layers across have them
+
+    def packed(made: SmolVLAModel) -> list[Any]:
+        vision, prefix = Vision.pack(made, PLAIN, bfloat16), Prefix.pack(made, PLAIN, bfloat16)
+        pairs = [(*one.norm1, *one.qkv, *one.out, *one.norm2, *one.fc1, *one.fc2) for one in vision.layers]
+        layers = [(one.qkv, one.out, one.gate_up, one.down, one.norm1, one.norm2) for one in prefix.layers]
+        across = [matrices for _, matrices in prefix.across]
+        ends = (*vision.patch, vision.positions, *vision.norm, vision.projector, *prefix.special)
+        return [one for some in (*pairs, *layers) for one in some] + [*across, *ends, Expert.pack(made).packed.weights]
+
+    assert all(torch.equal(one, other) for one, other in zip(packed(placed), packed(plain), strict=True))
+    assert before == {name: weight.data_ptr() for name, weight in placed.named_parameters()}

@@ -1,6 +1,7 @@
 """SmolVLA's denoising loop in the portable kernel, run on a CPU thread by thread, against the reference's loop."""
 
 import copy
+import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from turbopi.models.smolvla.reference import SmolVLAModel
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")]
 CPU = torch.device("cpu")
+FOUR_WARPS = dataclasses.replace(denoise.IN_RANGES, warps=4)
 SMALL = TextConfig(width=64, mlp_dim=48, num_heads=6, num_kv_heads=2, head_dim=16, vocab_size=20, depth=4)
 
 
@@ -53,9 +55,11 @@ def run(
     choice: denoise.Choices | None = None,
     *,
     before: Tensor | None = None,
+    seed: int = 0,
 ) -> Tensor:
     def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
-        return Emulated(sizes, folder, 0, prepare=False), Emulated(sizes, folder, 0, prepare=True)
+        assert choice is None or sizes["TP_ACROSS_AT_ONCE"] == choice.across_at_once
+        return Emulated(sizes, folder, seed, prepare=False), Emulated(sizes, folder, seed, prepare=True)
 
     monkeypatch.setattr(denoise, "load", load)
     monkeypatch.setattr(denoise, "unavailable", lambda device, weights: None)
@@ -77,17 +81,26 @@ def run(
 
 
 @pytest.mark.parametrize(
-    ("sizes", "suffix", "length", "blocks"),
+    ("sizes", "suffix", "length", "blocks", "choice"),
     [
-        ({"self_every": 2, "expert_depth": 4}, 10, 21, 3),
-        ({"self_every": 2, "expert_depth": 2}, 3, 5, 1),  # beside every second text layer: all are self layers
-        ({"self_every": 0, "expert_depth": 4}, 17, 30, 2),
-        ({"self_every": None, "expert_depth": 4}, 50, 30, 4),
-        ({"self_every": 3, "expert_depth": 4}, 10, 460, 3),  # keys in several shares
+        ({"self_every": 2, "expert_depth": 4}, 10, 21, 3, None),
+        ({"self_every": 2, "expert_depth": 2}, 3, 5, 1, None),  # beside every second text layer: all are self layers
+        ({"self_every": 0, "expert_depth": 4}, 17, 30, 2, None),
+        ({"self_every": None, "expert_depth": 4}, 50, 30, 4, None),
+        ({"self_every": 3, "expert_depth": 4}, 10, 460, 3, None),  # keys in several shares
+        ({"self_every": 2, "expert_depth": 4}, 10, 200, 13, denoise.IN_RANGES),  # a block has nothing across
+        ({"self_every": 0, "expert_depth": 4}, 17, 30, 18, FOUR_WARPS),
+        ({"self_every": 3, "expert_depth": 4}, 8, 30, 6, FOUR_WARPS),
     ],
 )
 def test_the_loop_is_as_exact_as_ordinary_bf16(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sizes: dict[str, Any], suffix: int, length: int, blocks: int
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    sizes: dict[str, Any],
+    suffix: int,
+    length: int,
+    blocks: int,
+    choice: denoise.Choices | None,
 ) -> None:
     steps, made = 2, model(1, **sizes)
     kept = cache(made, length + 9, length)
@@ -95,7 +108,7 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
     exact = made.denoise(kept, noise[None], steps)[0]
     ordinary = copy.deepcopy(made)
     ordinary.expert.bfloat16()
-    ours = run(made, kept, noise, steps, monkeypatch, tmp_path, blocks)
+    ours = run(made, kept, noise, steps, monkeypatch, tmp_path, blocks, choice)
     error, usual = (
         relative(one.numpy(), exact.numpy()) for one in (ours, ordinary.denoise(kept, noise[None], steps)[0])
     )
@@ -110,3 +123,14 @@ def test_a_call_that_was_not_finite_leaves_nothing_behind(monkeypatch: pytest.Mo
         for one in (None, torch.full((3, 16), torch.nan))
     )
     assert torch.equal(usual, after)
+
+
+def test_across_in_one_phase_it_is_right_in_whatever_order_threads_go(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = model(1, self_every=2, expert_depth=4)
+    kept, noise = cache(made, 30, 21), torch.randn(10, 16, generator=torch.Generator().manual_seed(3))
+    first, *others = (
+        run(made, kept, noise, 2, monkeypatch, tmp_path, 13, FOUR_WARPS, seed=seed) for seed in (0, 4, 5, 6)
+    )
+    assert all(torch.equal(first, other) for other in others)

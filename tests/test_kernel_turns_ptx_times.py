@@ -9,8 +9,11 @@ import torch
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from kernel_turns import ptx_times
-from kernel_turns.ptx_times import TimedAsPtx, TimedTile, ceilings, large, ratios, read_ptx_times
+from kernel_turns.ptx_times import PtxTimes, TimedAsPtx, TimedTile, ceilings, large, ratios, read_ptx_times, stage_times
+from packed import read_packed
 
+from turbopi.bench.predict import AS_PTX, PTX_SOURCE
+from turbopi.kernels.tile_table import Numbers
 from turbopi.support.errors import ConfigError
 from turbopi.support.provenance import provenance
 from turbopi.tune.shapes import Operation
@@ -42,6 +45,19 @@ def test_a_stages_ratio_counts_uses_and_fp8s_norms_for_int8_too() -> None:
     ]
     assert ratios(rows, "fp8") == {"prefix": pytest.approx(3.0)}
     assert ratios(rows, "int8") == {"prefix": pytest.approx(2.0)}
+
+
+@pytest.mark.parametrize("numbers", ["fp8", "int8"])
+def test_predictions_go_by_the_checked_in_times(numbers: Numbers) -> None:
+    rows = read_packed(Path(__file__).parents[1] / "benchmarks/results" / PTX_SOURCE, PtxTimes).rows
+    one, rate = AS_PTX[numbers], ceilings(rows)[numbers]
+    assert one.tflops == pytest.approx(rate / 1e6, abs=0.1)
+    own = [row for row in rows if row.operation.uses and row.operation.numbers == numbers]
+    largest = max(own, key=lambda row: row.flops)
+    assert one.large == pytest.approx(largest.usual.microseconds * rate / largest.flops, abs=0.001)
+    for stage, (took, least) in stage_times(rows, numbers).items():
+        assert one.milliseconds[stage] == pytest.approx(took / 1e3, abs=0.001)
+        assert one.floor(stage) == pytest.approx(least / 1e3, rel=0.04), "4,352 hidden columns of 4,304, bf16 attention"
 
 
 def test_the_result_says_which_gpu_it_is_and_what_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -360,7 +360,8 @@ def portable_barriers(files: dict[str, str]) -> tuple[list[str], dict[str, int]]
             if times := len(re.findall(r"__syncthreads\(\)", body)):
                 in_block[function] = times
             if function == "turbopi_portable_denoise":
-                events = re.findall(r"\b(?:grid\.)?(arrive|wait|embed|combine|advance|attend|product\.run)\(", body)
+                names = "arrive|wait|embed|combine|advance|attend|attend_across|product\\.run"
+                events = re.findall(rf"\b(?:grid\.)?({names})\(", body)
     return events, in_block
 
 
@@ -372,17 +373,29 @@ def test_the_portable_tables_say_what_the_code_does() -> None:
     events = [event for one in rows.values() for event in one[""].split("; ")]
     counts = {name: int(one[""]) for name, one in entries(in_block).items() if one.get("guards")}
     assert (events, counts) == portable_barriers(files)
-    waiting = {name for name, body in functions("product", files["product"]) if "grid.wait()" in body}
-    waiting |= {name for name, body in functions("attention", files["attention"]) if "grid.wait()" in body}
-    assert waiting == {"Product::run", "attend"}, "what `product.run` and `attend` wait for"
-    assert "expected += BLOCKS;" in files["primitives"] and "while (arrived < expected)" in files["primitives"]
+    parts = ("product", "attention", "attention_by_warps")
+    waiting = {name for part in parts for name, body in functions(part, files[part]) if "grid.wait()" in body}
+    assert waiting == {"Product::run", "attend", "attend_by_warps"}, "what `product.run` and `attend` wait for"
+    assert "expected += phases * BLOCKS;" in files["primitives"] and '"r"(phases)' in files["primitives"]
+    assert "while (arrived < expected)" in files["primitives"]
+
+
+def test_of_two_phases_that_are_one_blocks_arrive_at_both() -> None:
+    files = read(PORTABLE)
+    across = dict(functions("attention_by_warps", files["attention_by_warps"]))["attend_across"]
+    assert across.count("product.run(grid, ") == 1, "where it waits for other blocks"
+    before = across.partition("product.run(")[0]
+    assert not re.search(r"args\.(queries|keys|values|stream|squares|x)\b", before)
+    assert re.search(r"attend_across\([^;]*;\s*grid\.arrive\(2\);", files["kernel"])
 
 
 @pytest.mark.parametrize(
     ("file", "text", "planted"),
     [
-        ("kernel", "        grid.wait();\n        combine", "        combine"),
-        ("kernel", "      grid.arrive();\n      ahead<GateUpShape>", "      ahead<GateUpShape>"),
+        ("kernel", "          grid.wait();\n          combine", "          combine"),
+        ("kernel", "        grid.arrive();\n        ahead<GateUpShape>", "        ahead<GateUpShape>"),
+        ("kernel", "        grid.arrive(2);\n", ""),
+        ("attention_by_warps", "  if (!busy) return;\n  __syncthreads();", "  if (!busy) return;"),
         ("attention", "    __syncthreads();\n    softmax", "    softmax"),
     ],
 )  # fmt: skip

@@ -20,12 +20,15 @@ from kernel_turns.problems import (
     standing_for,
 )
 
+from turbopi.engine import smolvla
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise import packing
 from turbopi.kernels.portable.denoise.packing import PackedExpert, WeightNumbers
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.models.pi0.denoise import euler_step
+from turbopi.models.smolvla.config import SmolVLAConfig
+from turbopi.models.smolvla.family import BASE
 from turbopi.quantization.formats import FORMATS, INT8, Format
 from turbopi.support.errors import BackendError, BackendUnavailable
 
@@ -108,6 +111,28 @@ def test_older_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 6))
     assert denoise.unavailable(GPU) is None
     assert "in FP8 needs compute capability 8.9 or newer, this GPU has 8.6" in str(denoise.unavailable(GPU, "fp8"))
+
+
+@pytest.mark.parametrize(
+    ("blocks", "cache_rows", "suffix", "at_once"),
+    [(132, 241, 50, True), (132, 257, 50, False), (131, 241, 50, False), (132, 241, 16, False), (132, 241, 64, True)],
+)
+def test_layers_across_are_one_phase_where_blocks_and_warps_are_enough(
+    blocks: int, cache_rows: int, suffix: int, at_once: bool
+) -> None:
+    config = BASE.model
+    assert isinstance(config, SmolVLAConfig)
+    made = smolvla.form(config)
+    sizes = denoise.kernel_sizes(
+        smolvla.ExpertSizes.of(config),
+        blocks=blocks,
+        cache_rows=cache_rows,
+        suffix=suffix,
+        weights="bf16",
+        choice=denoise.choices(suffix, made, blocks),
+        form=made,
+    )
+    assert sizes["TP_ACROSS_AT_ONCE"] == at_once
 
 
 @pytest.mark.slow

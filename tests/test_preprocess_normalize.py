@@ -25,7 +25,7 @@ DELTA = packed_arrays(FOLDER / "delta_absolute.npz")
 PAD = np.load(FOLDER / "pad.npz")
 REFUSED: list[str] = json.loads((FOLDER / "normalize_refused.json").read_text())
 CASES = [name for name in NORMALIZED if name.split("/")[-2] != "in"]
-LEROBOT: list[NormMode] = ["lerobot_quantile", "lerobot_zscore", "lerobot_min_max"]
+LEROBOT: list[NormMode] = ["lerobot_quantile", "lerobot_quantile10", "lerobot_zscore", "lerobot_min_max"]
 
 
 def stats_of(name: str) -> NormStats:
@@ -66,7 +66,7 @@ def test_widths_that_openpi_refuses_are_refused(case: str) -> None:
 
 
 def test_unnormalising_leaves_dimensions_past_the_statistics_alone() -> None:
-    stats = FeatureStats(*(np.array([v, v]) for v in (0.5, 2.0, -1.0, 3.0, -2.0, 4.0)))
+    stats = FeatureStats(*(np.array([v, v]) for v in (0.5, 2.0, -1.0, 3.0, -2.0, 4.0, -0.5, 2.5)))
     x = np.array([[0.25, -0.5, 0.75]], np.float32)
     for mode in get_args(NormMode):
         if mode != "zscore":
@@ -83,7 +83,7 @@ def test_unnormalising_undoes_normalising(data: st.DataObject, mode: NormMode) -
     d = data.draw(st.integers(1, 6))
     vector = arrays(np.float64, d, elements=FINITE)
     low, span, x = data.draw(vector), data.draw(arrays(np.float64, d, elements=st.floats(0.1, 50))), data.draw(vector)
-    stats = FeatureStats(mean=low, std=span, q01=low, q99=low + span, min=low, max=low + span)
+    stats = FeatureStats(mean=low, std=span, q01=low, q99=low + span, min=low, max=low + span, q10=low, q90=low + span)
     scale = Normalizer(mode, stats, "state")
     back = scale.unnormalize(scale.normalize(x))
     bound = 2e-3 if mode in LEROBOT else 1e-9  # float32 there, with values of 1e3 to 1e4 on the way
@@ -96,14 +96,14 @@ def test_lerobots_modes_compute_what_torch_does_in_float32(mode: NormMode) -> No
     a, b, x = rng.normal(size=(3, 8)).astype(np.float32)
     b = np.abs(b)
     b[3] = a[3] if mode != "lerobot_zscore" else 0.0  # a constant dimension
-    stats = FeatureStats(mean=a, std=b, q01=a, q99=b, min=a, max=b)
+    stats = FeatureStats(mean=a, std=b, q01=a, q99=b, min=a, max=b, q10=a, q90=b)
     ta, tb, tx = map(torch.from_numpy, (a, b, x))
     span = torch.where(tb - ta == 0, torch.tensor(1e-8), tb - ta)
     if mode == "lerobot_zscore":
         forward, back = (tx - ta) / (tb + 1e-8), tx * tb + ta
     else:
         forward = 2 * (tx - ta) / span - 1
-        back = (tx + 1) * span / 2 + ta if mode == "lerobot_quantile" else (tx + 1) / 2 * span + ta
+        back = (tx + 1) * span / 2 + ta if "quantile" in mode else (tx + 1) / 2 * span + ta
     scale = Normalizer(mode, stats, "state")
     for ours, theirs in ((scale.normalize(x), forward), (scale.unnormalize(x), back)):
         assert ours.dtype == np.float64
@@ -112,7 +112,7 @@ def test_lerobots_modes_compute_what_torch_does_in_float32(mode: NormMode) -> No
 
 @pytest.mark.parametrize("mode", LEROBOT)
 def test_lerobots_modes_want_the_statistics_width(mode: NormMode) -> None:
-    stats = FeatureStats(*(np.array([v, v]) for v in (0.5, 2.0, -1.0, 3.0, -2.0, 4.0)))
+    stats = FeatureStats(*(np.array([v, v]) for v in (0.5, 2.0, -1.0, 3.0, -2.0, 4.0, -0.5, 2.5)))
     with pytest.raises(ObservationError, match="state has 1 values, but the checkpoint's statistics cover 2"):
         Normalizer(mode, stats, "state").normalize(np.zeros(1))
 

@@ -20,7 +20,9 @@ Kind = Literal["pi05", "pi0", "pi0_fast", "smolvla"]
 WITH_MEMORY: tuple[Kind, ...] = ("pi05",)  # LeRobot has `MemoryConfig` in it alone
 WITH_TEXT: tuple[Kind, ...] = ("pi05",)  # what may have `TextConfig`
 FloatPrecision = Literal["bf16", "f32"]
-NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
+NormMode = Literal[
+    "quantile", "zscore", "lerobot_quantile", "lerobot_quantile10", "lerobot_zscore", "lerobot_min_max", "identity"
+]
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's order; prefix tokens follow it
 

@@ -20,14 +20,14 @@ ALLOWED: dict[str, dict[int, int]] = {
     # Into INT8, tiles that only a measurement chooses
     "attention.prefix": {90: 16},
     "batch.packed": {90: 8},
-    # As `denoise.kernel`, in the 128 registers that 16 warps leave. Timed on an H200 with 40 of them at 9.0. In
-    # attention a warp holds 16 keys and their values: 8 to 16 bytes more at 8.0, 8.9 and 11.0, less elsewhere
+    # As `denoise.kernel`, in the 128 registers that 16 warps leave. In attention a warp holds 16 keys and their values:
+    # 8 to 16 bytes more at 8.0, 8.9 and 11.0, less elsewhere. From 9.0 on, layers across are one phase
     "SmolVLA's denoise.kernel": {
         80: 56,
         86: 40,
         87: 128,
         89: 32,
-        90: 40,
+        90: 32,
         100: 16,
         103: 16,
         110: 168,

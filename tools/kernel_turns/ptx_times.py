@@ -214,8 +214,8 @@ def ceilings(rows: list[TimedAsPtx]) -> dict[Numbers, float]:
     return found
 
 
-def ratios(rows: list[TimedAsPtx], numbers: Numbers) -> dict[str, float]:
-    """Of vision's and prefix' operations: their time in a call, in the cost model's tiles, over that at the ceiling.
+def stage_times(rows: list[TimedAsPtx], numbers: Numbers) -> dict[str, tuple[float, float]]:
+    """Microseconds of vision's and prefix' operations of a call, in the cost model's tiles, and those at the ceiling.
 
     Attention is bfloat16's. Norms are FP8's of the same operation; without FP8 they are left out.
     """
@@ -231,7 +231,11 @@ def ratios(rows: list[TimedAsPtx], numbers: Numbers) -> dict[str, float]:
             stage, around = one.name.split()[0], norms.get((one.name, one.inner), 0.0)
             took[stage] = took.get(stage, 0.0) + one.uses * (row.usual.microseconds + around)
             least[stage] = least.get(stage, 0.0) + one.uses * row.flops / of[one.numbers]
-    return {stage: took[stage] / least[stage] for stage in took}
+    return {stage: (took[stage], least[stage]) for stage in took}
+
+
+def ratios(rows: list[TimedAsPtx], numbers: Numbers) -> dict[str, float]:
+    return {stage: took / least for stage, (took, least) in stage_times(rows, numbers).items()}
 
 
 def said(row: TimedAsPtx) -> str:

@@ -19,7 +19,7 @@ from turbopi.backends.qualification import DENOISE, excluded
 from turbopi.backends.tuned_tiles import tiles_of
 from turbopi.config import Network
 from turbopi.engine import smolvla
-from turbopi.engine.graph import HEAD, Graph, Mark, building
+from turbopi.engine.graph import HEAD, Graph, Mark, building, empty_cache
 from turbopi.engine.smolvla_batch import ExpertByOps
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import fused_ops
@@ -72,7 +72,9 @@ class FusedSmolVLABackend(CapturedBackend):
         return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'cuda_graph'"
 
     def load_weights(self, load: LoadState) -> None:
-        super().load_weights(load)
+        super().load_weights(
+            lambda to, precision: load(smolvla.Placement(self.config, self.device, self._dtype), precision)
+        )
         self._tiles, self._without = tiles_of(self.device), excluded(self.device, self.precision, self.config)
         ops = self._make_ops()
         self._tower = smolvla.Vision.pack(self.model, ops, self._dtype)
@@ -81,6 +83,7 @@ class FusedSmolVLABackend(CapturedBackend):
         self._expert = smolvla.Expert.pack(self.model)
         self._ops, self._origin = ops, ops.origin
         self._by_ops: ExpertByOps | None = None  # its matrices are made for the first batch
+        empty_cache()  # of what loading and packing needed besides
 
     def _make_ops(self) -> Ops:
         return fused_ops(self.device, self._tiles.table, self._without)

@@ -34,15 +34,17 @@ SWITCHES = ("TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE")  # 1: torch.compile 
 
 def compiled(stage: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`stage`, compiled on first use for each variant of its arguments. It never runs without being compiled: the call
-    then raises BackendError.
+    then raises BackendError. The compiler, whose import takes seconds, is imported by the first use, too.
     """
-    jitted = torch.compile(stage, fullgraph=True, options=INDUCTOR, **options)
+    made: list[Callable[..., Any]] = []
 
     def call(*args: Any) -> Any:
+        if not made:
+            made.append(torch.compile(stage, fullgraph=True, options=INDUCTOR, **options))
         limits = {"recompile_limit": MOST_VARIANTS, "accumulated_recompile_limit": MOST_OF_ALL}
         with torch._dynamo.config.patch(limits):
             try:
-                return jitted(*args)
+                return made[0](*args)
             except torch._dynamo.exc.FailOnRecompileLimitHit as e:
                 raise BackendError(
                     f"backend 'pytorch_compile' has compiled {stage.__name__} for {MOST_VARIANTS} batch sizes, cameras "

@@ -11,6 +11,11 @@ The floor is `work.py`'s counts at the published rates. Of a measured call each 
             and all else is ratio, as on Hopper; at the lower end the ratio is bf16's.
             Of denoising, which reads weights: 1, or as a large copy reaches on Hopper
 
+In 8 bits on GPUs whose products are mma.sync's (MMA_SYNC) vision and prefix go by the same operations timed as PTX for
+mma.sync on the H200 (AS_PTX), whose floor is at the rate of a large product of that PTX. The ratio is that of a call's
+largest product and all else is delay; at the higher end all of it may be ratio, too. Hopper emulates mma.sync of E4M3:
+FP8's delays are at the lower end no more than INT8's.
+
 docs/dev/performance.md works through an RTX 4090. What chunks longer than the measured call's add is what it was with
 the same kernels in other precisions.
 
@@ -34,7 +39,32 @@ MOST_TOKENS: dict[Kernels, int] = {"hopper": 56, "portable": 64}  # that the den
 _BYTES = {"bf16": 2, "fp8": 1, "int8": 1}
 # Of the published rates, by a large bf16 matmul and a large copy on the H200: h200_2026-11-24_portable_kernels.json
 REACHED = {"matmul": 0.78, "copy": 0.88}
+MMA_SYNC = (8, 12)  # compute capabilities' first numbers
 CLOCKS = (0.75, 1.5)  # of a cycle of Hopper's 1.98 GHz: published clocks are 1.3 GHz (Jetson AGX Orin) to 2.6 (GeForce)
+
+
+class AsPtx(Struct, frozen=True):
+    """The portable kernels' operations of the main job, as PTX for compute capability 8.9, on the H200."""
+
+    tflops: float  # of a large product
+    large: float  # times its floor that a call's largest product takes
+    milliseconds: dict[str, float]  # of vision's and prefix' operations; RoPE, patches and the projector aren't in them
+
+    def floor(self, stage: str) -> float:
+        """Milliseconds at the rate of a large product."""
+        work = stage_work(ModelConfig(), Job(), 1)[stage]
+        return floor_ms(work, self.tflops * 1e12, find_gpu("h200").gb_per_second * 1e9)
+
+    def delays(self, stage: str) -> float:
+        """Milliseconds that aren't in proportion to the floor."""
+        return self.milliseconds[stage] - self.large * self.floor(stage)
+
+
+PTX_SOURCE = "h200_2026-11-30_ptx_times_89.json.xz"
+AS_PTX = {
+    "fp8": AsPtx(351.4, 1.147, {"vision": 2.910, "prefix": 9.679}),
+    "int8": AsPtx(778.3, 1.260, {"vision": 1.790, "prefix": 4.953}),
+}
 
 
 class PredictedCall(Struct, frozen=True, kw_only=True):
@@ -95,6 +125,10 @@ def predicted_call(gpu: GpuSpec, config: ModelConfig, job: Job, measured: Measur
     clocks = (1.0,) if gpu.key == measured.gpu else CLOCKS
     for stage, ratios in _ratios(measured).items():
         denoises = stage == "denoise"
+        if not denoises and by_ptx(measured.kernels, measured.precision, gpu):
+            least, most = _as_ptx(measured.precision, stage, there[stage])
+            low, high = low + least, high + most
+            continue
         again = job.steps / measured.job.steps if denoises else 1.0
         ends = [
             (took[stage] + more - ratio * here[stage]) * again * clock + ratio * there[stage]
@@ -116,6 +150,20 @@ def predicted_call(gpu: GpuSpec, config: ModelConfig, job: Job, measured: Measur
         measured_job=measured.job,
         source=measured.source,
     )
+
+
+def by_ptx(kernels: Kernels, precision: str, gpu: GpuSpec) -> bool:
+    """Whether vision and prefix go by AS_PTX there."""
+    return kernels == "portable" and precision in AS_PTX and gpu.capability[0] in MMA_SYNC
+
+
+def _as_ptx(precision: str, stage: str, floor: float) -> tuple[float, float]:
+    """Milliseconds, at least and at most, of a stage with that published floor."""
+    one = AS_PTX[precision]
+    delays, reached = one.delays(stage), floor / REACHED["matmul"]
+    least = min(delays, AS_PTX["int8"].delays(stage)) * CLOCKS[0] + one.large * floor
+    most = max(delays * CLOCKS[1] + one.large * reached, one.milliseconds[stage] / one.floor(stage) * reached)
+    return least, most
 
 
 def _floors_and_times(call: MeasuredCall) -> tuple[dict[str, float], dict[str, float]]:

@@ -55,6 +55,7 @@ _EMPTY_CAMERA = re.compile(re.escape(EMPTY_CAMERA) + "[0-9]+")
 
 _MODES: dict[str, NormMode] = {
     "QUANTILES": "lerobot_quantile",
+    "QUANTILE10": "lerobot_quantile10",
     "MEAN_STD": "lerobot_zscore",
     "MIN_MAX": "lerobot_min_max",
     "IDENTITY": "identity",

@@ -17,11 +17,12 @@ from turbopi.checkpoint.lerobot_keys import SMOLVLA, Keys
 from turbopi.checkpoint.lerobot_pipeline import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, TOKENIZER
 from turbopi.checkpoint.names import Names
 from turbopi.checkpoint.source import WeightSource
-from turbopi.checkpoint.vision_positions import SHIFTED, ShiftedPositions, position_rows
+from turbopi.checkpoint.vision_positions import SHIFTED, ShiftedPositions
 from turbopi.config import LIMITS, Network, Normalization, PolicyConfig, TimeRounding
 from turbopi.models import Family
 from turbopi.models.smolvla.config import PUBLISHED, SmolVLAConfig, from_lerobot
 from turbopi.models.smolvla.names import canonical_name, native_name
+from turbopi.models.smolvla.positions import position_rows
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.hub_cache import hub_folder
 from turbopi.support.reading import Fields, read_json, shown
@@ -185,8 +186,6 @@ class SmolVLAFolder(LeRobotFolder):
             raise CheckpointError(f"{source} has {other}. {USE_LEROBOT}")
         if (problem := _problem(network)) is not None:
             raise CheckpointError(f"{self.file} with the sizes of {source}: {problem}; LeRobot can't run it either")
-        if (other := _not_computed(network)) is not None:
-            raise CheckpointError(f"{self.file} with the sizes of {source}: {other}. {USE_LEROBOT}")
         if versions.smolvla_sums_up_time(self.config.values) and self.settings.values.get("lerobot_semantics") != "0.6":
             return SummedTimes(**{one.name: getattr(network, one.name) for one in fields(network)})
         return network
@@ -199,10 +198,13 @@ class SmolVLAFolder(LeRobotFolder):
                 f"{self.settings.source}: vision_positions is {SHIFTED!r}, but {self.file} has load_vlm_weights = "
                 "true: in a bfloat16 vision tower no version of transformers shifted them"
             )
-        patch = network.vision.patch_size
-        return ShiftedPositions(
-            source, network.vision.image_size // patch, network.image_size // patch, self.settings.source
-        )
+        table, patches = (size // network.vision.patch_size for size in (network.vision.image_size, network.image_size))
+        if position_rows(patches, table, "float32").tolist() != [i * table // patches for i in range(patches)]:
+            raise ConfigError(
+                f"{self.settings.source}: vision_positions is {SHIFTED!r}, which isn't computed for {patches} patches "
+                f"a side and a table of {table}, whose quotients aren't exact"
+            )
+        return ShiftedPositions(source, table, patches, self.settings.source)
 
     def _vlm(self) -> tuple[Mapping[str, Any], str]:
         """The vision-language model's config, and where it is from."""
@@ -277,18 +279,4 @@ def _problem(network: SmolVLAConfig) -> str | None:
         return "heads don't divide the widths"
     if network.expert_depth < 1 or text.depth % network.expert_depth:
         return f"{network.expert_depth} layers of the expert don't go into {text.depth} text layers"
-    return None
-
-
-def _not_computed(network: SmolVLAConfig) -> str | None:
-    """What LeRobot computes and Turbo-Pi doesn't, if anything."""
-    patch, size, kind = network.vision.patch_size, network.image_size, network.element_types.vision
-    patches, table = size // patch, network.vision.image_size // patch
-    if rest := size % patch:
-        return f"images of {size} pixels leave {rest} beside {patches} patches of {patch}; Turbo-Pi reads whole ones"
-    if position_rows(patches, table, kind) != [i * table // patches for i in range(patches)]:
-        return (
-            f"LeRobot's rounding of {patches} patches' positions in {kind} misses rows of a table of {table}, which "
-            "Turbo-Pi takes exactly"
-        )
     return None

@@ -16,13 +16,14 @@ from turbopi.support.reading import files_below, is_finite, read_json, shown
 
 FILE_NAME = "norm_stats.json"
 STARVLAS = "dataset_statistics.json"
-STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
+STATISTICS = ("mean", "std", "q01", "q99", "min", "max", "q10", "q90")
 MAX_MAGNITUDE = 1e9  # of a statistic: metres, radians and encoder ticks are far below it, damaged floats mostly above
 
 NEEDS: dict[NormMode, tuple[str, ...]] = {
     "quantile": ("q01", "q99"),
     "zscore": ("mean", "std"),
     "lerobot_quantile": ("q01", "q99"),
+    "lerobot_quantile10": ("q10", "q90"),
     "lerobot_zscore": ("mean", "std"),
     "lerobot_min_max": ("min", "max"),
     "identity": (),
@@ -39,6 +40,8 @@ class FeatureStats:
     q99: np.ndarray | None = None
     min: np.ndarray | None = None
     max: np.ndarray | None = None
+    q10: np.ndarray | None = None  # 10 % and 90 % quantiles
+    q90: np.ndarray | None = None
 
     @property
     def available(self) -> tuple[str, ...]:
@@ -52,7 +55,8 @@ class FeatureStats:
         """CheckpointError for statistics that no data has, and that would mirror or blow up what they scale.
 
         Every statistic is float[dim] of finite numbers, |x| <= MAX_MAGNITUDE, and of one length; std >= 0, q01 <= q99,
-        min <= max. Equal ones are right: that dimension was constant, and the epsilons of normalize.py are for it.
+        min <= max, q10 <= q90. Equal ones are right: that dimension was constant, and the epsilons of normalize.py are
+        for it.
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in self.available}
         for name, array in arrays.items():
@@ -67,7 +71,7 @@ class FeatureStats:
             raise CheckpointError(f"{where}: statistics have different lengths: {lengths}")
         if "std" in arrays:
             _refuse(arrays["std"] < 0, where, "expected a deviation, 0 or more", {"std": arrays["std"]})
-        for low, high in (("q01", "q99"), ("min", "max")):
+        for low, high in (("q01", "q99"), ("min", "max"), ("q10", "q90")):
             if low in arrays and high in arrays:
                 pair = {low: arrays[low], high: arrays[high]}
                 _refuse(arrays[low] > arrays[high], where, f"expected {low} <= {high}", pair)
@@ -174,7 +178,7 @@ def _is_row(values: object) -> bool:
 
 
 def dump_norm_stats(stats: NormStats) -> str:
-    """The text of a `norm_stats.json`; min and max, which openpi doesn't know and skips, are written if there."""
+    """The text of a `norm_stats.json`; what openpi doesn't know and skips, such as min, is written if there."""
     content: dict[str, dict[str, list[float] | None]] = {}
     for feature in fields(stats):
         found: FeatureStats = getattr(stats, feature.name) or FeatureStats()

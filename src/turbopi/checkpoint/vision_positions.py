@@ -13,7 +13,6 @@ from typing import Any
 import torch
 
 from turbopi.checkpoint.source import Piece, WeightSource
-from turbopi.models.smolvla.config import ElementType
 from turbopi.support.errors import ConfigError
 
 EXACT, SHIFTED = "exact", "shifted"
@@ -52,15 +51,4 @@ def shifted_rows(table: int, patches: int) -> torch.Tensor:
     rows = torch.arange(table)
     for i in range(patches):
         rows[i * table // patches] = max(-(-i * table // patches) - 1, 0)
-    return rows
-
-
-def position_rows(patches: int, table: int, element_type: ElementType) -> list[int]:
-    """For each of an image's rows of patches, the row of the position table that transformers' rounding takes today.
-
-    floor(i * table / patches), but where that is whole and a quotient isn't: one row before or behind it.
-    """
-    at = (torch.arange(patches, dtype=torch.float32) * (1.0 / torch.tensor(patches))).clamp(max=1 - 1e-6)
-    begins = torch.arange(1 / table, 1.0, 1 / table)
-    rows: list[int] = torch.bucketize(at.to(getattr(torch, element_type)), begins, right=True).tolist()
     return rows

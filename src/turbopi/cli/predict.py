@@ -83,7 +83,7 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     """What the tables mean, where their numbers come from, and what can't run."""
     from turbopi.backends import PRECISIONS
     from turbopi.bench.measured import KERNELS
-    from turbopi.bench.predict import refused
+    from turbopi.bench.predict import PTX_SOURCE, by_ptx, refused
 
     measured = any(one.was_measured(call) for one in predictions for call in one.calls)
     lines = [
@@ -95,6 +95,8 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     ]
     calls = {(call.backend, call.kernels, call.measured_on, call.source) for one in predictions for call in one.calls}
     lines += [f"{name}, {KERNELS[kernels]}, as on {gpu}: {source}" for name, kernels, gpu, source in sorted(calls)]
+    if any(by_ptx(call.kernels, one.precision, one.gpu) for one in predictions for call in one.calls):
+        lines.append(f"in 8 bits on 8.x and 12.x vision and prefix as PTX for 8.9 on h200: {PTX_SOURCE}")
     if any(_not_its_own(one.gpu, call) for one in predictions for call in one.calls):
         lines.append("portable: fused with TURBOPI_KERNELS=portable")
     without = [one for one in predictions if not one.calls]

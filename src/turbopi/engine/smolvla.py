@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from turbopi.config import GemmaConfig
 from turbopi.engine.forward import HEAD_LAYERS, Rope, VisionByOps
+from turbopi.engine.weight_placement import WeightPlacement
 from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, VisionStream
 from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
@@ -36,6 +37,19 @@ def refusal(config: SmolVLAConfig) -> str | None:
     if config.text.head_dim < 16 or config.vision.head_dim < 16:
         return "heads are narrower than a tensor core's 16 columns"
     return refusal_of_sizes(ExpertSizes.of(config).expert)
+
+
+class Placement(WeightPlacement):
+    """Where a checkpoint is read to: all on the device, parts of merged matrices in their places. Vision and connector
+    come in the dtype that they are packed in, whatever the config says: nothing else reads them.
+    """
+
+    def __init__(self, config: Any, device: torch.device, packed: torch.dtype) -> None:
+        super().__init__(config, device, on_host=lambda name: False)
+        self._packed = packed
+
+    def __call__(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return super().__call__(name, shape, self._packed if name.startswith(("vision.", "projector.")) else dtype)
 
 
 # -- vision -----------------------------------------------------------------------------------------------------------
@@ -83,6 +97,8 @@ class Vision:
     def _embed(self, images: Tensor) -> Tensor:
         """[V, patches, W]"""
         p, (count, side) = self.model.config.vision.patch_size, images.shape[:2]
+        if rest := side % p:  # pixels beside whole patches
+            images = images[:, : side - rest, : side - rest].contiguous()
         pixels = normalize_images(images).view(count, side // p, p, side // p, p, 3).permute(0, 1, 3, 5, 2, 4)
         patches = self.projector.new_empty(pixels.shape).copy_(pixels)  # both in one kernel
         return F.linear(patches.view(count, -1, 3 * p * p), *self.patch) + self.positions
@@ -298,9 +314,8 @@ class Expert:
         norms = [norm for layer in layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
         scale = torch.stack([norm.weight.float() for norm in (*norms, model.expert.norm)])
         table = torch.stack((scale, torch.zeros_like(scale), torch.ones_like(scale)), dim=1)[None]
-        packed = PackedExpert.pack(
-            ExpertSizes.of(config), [joined(layer, torch.bfloat16) for layer in layers], form=form(config)
-        )
+        one_by_one = (joined(layer, torch.bfloat16) for layer in layers)
+        packed = PackedExpert.pack(ExpertSizes.of(config), one_by_one, form=form(config))
         return cls(packed, table, model)
 
     def denoiser(

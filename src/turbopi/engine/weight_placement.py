@@ -74,6 +74,8 @@ class WeightPlacement:
         device, names = HOST if on_host else self.device, joined_with(name)
         if names is None:
             return torch.empty(shape, dtype=dtype, device=device)
+        if len({self._alike(one) for one in names}) > 1:  # SmolVLA's, of a layer across: they aren't joined
+            return torch.empty(shape, dtype=dtype, device=device)
         if names not in self._parts:
             rows = [self._shapes[one][0] for one in names]
             whole = torch.empty(sum(rows), *shape[1:], dtype=dtype, device=device)
@@ -82,6 +84,10 @@ class WeightPlacement:
         if not self._parts[names]:
             del self._parts[names]
         return part
+
+    def _alike(self, name: str) -> tuple[tuple[int, ...], torch.dtype]:
+        """What parts of one matrix have in common."""
+        return self._shapes[name][1:], family_of(self._config).parameter_dtype(name, "bf16", self._config)
 
     def takes(self, name: str) -> bool:
         return name in self._places

@@ -63,7 +63,7 @@ class Normalizer:
                     return np.asarray(b + _OPENPI_EPS)
                 case "lerobot_zscore":
                     return np.asarray(b + np.float32(_LEROBOT_EPS))
-                case _:  # lerobot_quantile, lerobot_min_max
+                case _:  # lerobot_quantile, lerobot_quantile10, lerobot_min_max
                     span = b - a
                     return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
 
@@ -83,7 +83,7 @@ class Normalizer:
                     return np.asarray((x - a) / span)
                 case "lerobot_zscore":
                     return np.asarray((x.astype(np.float32) - a) / span, np.float64)
-                case _:  # lerobot_quantile, lerobot_min_max
+                case _:  # lerobot_quantile, lerobot_quantile10, lerobot_min_max
                     return np.asarray(2.0 * (x.astype(np.float32) - a) / span - 1.0, np.float64)
 
     def says_something_past(self, width: int) -> bool:
@@ -118,7 +118,7 @@ class Normalizer:
                 return np.asarray((x + 1.0) / 2.0 * span + a)
             case "zscore":
                 return np.asarray(x * span + a)
-            case "lerobot_quantile":
+            case "lerobot_quantile" | "lerobot_quantile10":
                 return np.asarray((x + 1.0) * span / 2.0 + a)
             case _:  # lerobot_zscore: the epsilon is in the forward direction only
                 return np.asarray(x * b + a)

@@ -32,7 +32,8 @@ from turbopi.models.pi0.integrate import integrate, integrate_rows
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.pi0.layers import apply_rope, merge_heads, rms_normalize, rope_tables, split_heads
 from turbopi.models.pi0.vision import VisionTower, normalize_images
-from turbopi.models.smolvla.config import ROPE_BASE, SmolVLAConfig
+from turbopi.models.smolvla.config import ROPE_BASE, ElementType, SmolVLAConfig
+from turbopi.models.smolvla.positions import position_rows
 from turbopi.support.errors import ObservationError
 
 # Names of what a trace records, rows of one batch: image_embeddings [C * B, T, D], prefix [B, S, D], prefix_pad_mask,
@@ -119,10 +120,14 @@ class Layer(nn.Module):
 
 
 class Vision(VisionTower):
-    """SigLIP for patch grids of any size: float32[N, h, w, 3] in [-1, 1] -> [N, patches, W], in the weights' dtype."""
+    """SigLIP for patch grids of any size: float32[N, h, w, 3] in [-1, 1] -> [N, patches, W], in the weights' dtype.
 
-    def __init__(self, config: VisionConfig) -> None:
+    element_type  LeRobot's of this tower: positions are rounded in it. Pixels beside whole patches aren't read.
+    """
+
+    def __init__(self, config: VisionConfig, element_type: ElementType = "float32") -> None:
         super().__init__(config)
+        self.element_type = element_type
         for layer in self.layers:
             layer.self_attn.attend = vision_attention  # type: ignore[union-attr]
 
@@ -135,6 +140,7 @@ class Vision(VisionTower):
     def embed_patches(self, images: Tensor) -> Tensor:
         n, p = images.shape[0], self.config.patch_size
         rows, columns = images.shape[1] // p, images.shape[2] // p
+        images = images[:, : rows * p, : columns * p]
         patches = images.reshape(n, rows, p, columns, p, 3).permute(0, 1, 3, 5, 2, 4).flatten(3).flatten(1, 2)
         x = F.linear(patches, self.patch_embedding.weight.flatten(1), self.patch_embedding.bias)
         return x + self.positions(rows, columns)
@@ -142,8 +148,7 @@ class Vision(VisionTower):
     def positions(self, rows: int, columns: int) -> Tensor:
         """The position table at a grid of patches, [rows * columns, W]."""
         table, device = self.config.image_size // self.config.patch_size, self.position_embedding.weight.device
-        row = torch.arange(rows, device=device) * table // rows
-        column = torch.arange(columns, device=device) * table // columns
+        row, column = (position_rows(count, table, self.element_type, device) for count in (rows, columns))
         return self.position_embedding((row[:, None] * table + column).flatten())
 
 
@@ -186,7 +191,7 @@ class SmolVLAModel(nn.Module):
         self.config = config
         self.attend: Attend = attention
         text, width = config.text, config.expert_width
-        self.vision = Vision(config.vision)
+        self.vision = Vision(config.vision, config.element_types.vision)
         self.projector = nn.Linear(config.vision.width * config.scale_factor**2, text.width, bias=False)
         self.vlm = Text(config)
         self.expert = Expert(config)

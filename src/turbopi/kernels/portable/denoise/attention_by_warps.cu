@@ -25,16 +25,17 @@ constexpr int S_PART_TOPS = S_WORK + WARPS * 8 * PART_ROW;  // [warp][8 rows] la
 static_assert(!BY_WARPS || (HD <= 64 && !COMBINES && (WARPS & (WARPS - 1)) == 0 && WARPS <= 32), "heads or shares");
 static_assert(!BY_WARPS || (S_PART_TOPS + WARPS * 16) * 4 <= TP_SHARED_BYTES, "too little shared memory");
 
+template <int STEPS>
 struct OfWarp {  // of a lane: keys g and g + 8 of 16; of values keys 2 t, + 1, + 8, + 9
-  uint4 keys[WARP_STEPS][2][LOGIT_STEPS], values[WARP_STEPS][4];
+  uint4 keys[STEPS][2][LOGIT_STEPS], values[STEPS][4];
 };
 
 // Those of the prefix (the others are zeros), before the barrier; then those of the suffix.
-template <bool PREFIX>
-__device__ __forceinline__ void ask_of_warp(int thread, OfWarp& of, const Keys& keys, const Keys& values, int count) {
+template <bool PREFIX, int STEPS>
+__device__ __forceinline__ void ask_of_warp(int thread, OfWarp<STEPS>& of, const Keys& keys, const Keys& values, int count) {
   const int g = thread % 32 / 4, t = thread % 4;
 #pragma unroll
-  for (int n = 0; n < WARP_STEPS; ++n) {
+  for (int n = 0; n < STEPS; ++n) {
     const int first = (thread / 32 + n * WARPS) * 16;
     if (!PREFIX && (first + 16 <= keys.length || first >= count)) continue;
     const byte* const from_keys = PREFIX ? keys.prefix : keys.suffix - keys.length * HD * 2;
@@ -58,12 +59,13 @@ __device__ __forceinline__ void ask_of_warp(int thread, OfWarp& of, const Keys& 
 }
 
 // A warp's keys, for 8 rows: weighted values, largest logits and sums to shared memory.
-__device__ __forceinline__ void weigh_of_warp(int thread, float by, float* smem, const OfWarp& of,
+template <int STEPS>
+__device__ __forceinline__ void weigh_of_warp(int thread, float by, float* smem, const OfWarp<STEPS>& of,
                                               const uint4 (&queries)[LOGIT_STEPS], int seen) {
   const int warp = thread / 32, g = thread % 32 / 4, t = thread % 4;
-  float c[WARP_STEPS][2][4] = {}, top = -infinity(), sum = 0;
+  float c[STEPS][2][4] = {}, top = -infinity(), sum = 0;
 #pragma unroll
-  for (int n = 0; n < WARP_STEPS; ++n)
+  for (int n = 0; n < STEPS; ++n)
 #pragma unroll
     for (int half = 0; half < 2; ++half) {
       float(&here)[4] = c[n][half];
@@ -85,7 +87,7 @@ __device__ __forceinline__ void weigh_of_warp(int thread, float by, float* smem,
   const float from = top == -infinity() ? 0 : top;  // of no key that is seen all weights are 0
   float out[8][4] = {};
 #pragma unroll
-  for (int n = 0; n < WARP_STEPS; ++n) {
+  for (int n = 0; n < STEPS; ++n) {
     u32 weights[2];
 #pragma unroll
     for (int half = 0; half < 2; ++half) {
@@ -112,8 +114,14 @@ __device__ __forceinline__ void weigh_of_warp(int thread, float by, float* smem,
   if (t == 0) *(float2*)(smem + S_PART_TOPS + (warp * 8 + g) * 2) = make_float2(top, sum);
 }
 
-// All warps' parts of 8 rows, to `attended`. A warp has one row at a time.
-__device__ __forceinline__ void combine_warps(int thread, const Args& args, const float* smem, float attended_times, int eight) {
+struct Row {
+  int token, head;
+  bool valid;
+};
+
+// All warps' parts of 8 rows, to `attended`. A warp has one row at a time. row_of: its number among the 8 -> Row
+template <class RowOf>
+__device__ __forceinline__ void combine_warps(int thread, const Args& args, const float* smem, float attended_times, RowOf row_of) {
   const int lane = thread % 32;
 #pragma unroll
   for (int first = 0; first < 8 * 64; first += THREADS) {
@@ -134,14 +142,14 @@ __device__ __forceinline__ void combine_warps(int thread, const Args& args, cons
     for (int w = 0; w < WARPS; ++w) out += part[w] * __shfl_sync(~0u, weight, w);
     out *= attended_times / sum;
     const float next = __shfl_xor_sync(~0u, out, 1);
-    const int row = eight % EIGHTS * 8 + tile_row, head = eight / EIGHTS * GROUP + row % GROUP;
+    const Row row = row_of(tile_row);
     const int column = (place % 16 / 4 * 2 + place / 32) * 8 + place / 16 % 2 * 4 + place % 4;
-    if (place % 2 == 0 && row < ROWS && column < HD) store_operand(args.attended, row / GROUP, head * HD + column, out, next);
+    if (place % 2 == 0 && row.valid && column < HD) store_operand(args.attended, row.token, row.head * HD + column, out, next);
   }
 }
 
 // One block's rows, where what it needs of the prefix is asked for already.
-__device__ __forceinline__ void attend_eight(const Args& args, float* smem, OfWarp& of, Keys keys, Keys values, int eight,
+__device__ __forceinline__ void attend_eight(const Args& args, float* smem, OfWarp<WARP_STEPS>& of, Keys keys, Keys values, int eight,
                                              int count, int length, float attended_times) {
   const int thread = thread_of_phase();
   const int row = eight % EIGHTS * 8 + thread % 32 / 4;
@@ -157,7 +165,10 @@ __device__ __forceinline__ void attend_eight(const Args& args, float* smem, OfWa
   const int seen = CAUSAL ? min(count, length + row / GROUP + 1) : count;
   weigh_of_warp(thread, LOG2_E * args.logit_scale, smem, of, queries, seen);
   __syncthreads();
-  combine_warps(thread, args, smem, attended_times, eight);
+  combine_warps(thread, args, smem, attended_times, [&](int of_eight) {
+    const int at = eight % EIGHTS * 8 + of_eight;
+    return Row{at / GROUP, eight / EIGHTS * GROUP + at % GROUP, at < ROWS};
+  });
 }
 
 __device__ __forceinline__ void attend_by_warps(Grid& grid, const Args& args, float* smem, int layer, int length, float attended_times) {
@@ -167,7 +178,7 @@ __device__ __forceinline__ void attend_by_warps(Grid& grid, const Args& args, fl
     return Keys{cache + layer * args.layer_stride + head * HEAD_STRIDE, suffix + head * T * HD * 2, length};
   };
   Keys keys = of_head(block, args.cache_k, args.keys), values = of_head(block, args.cache_v, args.values);
-  OfWarp of;
+  OfWarp<WARP_STEPS> of;
   ask_of_warp<true>(thread, of, keys, values, block < KV_HEADS * EIGHTS ? total : 0);
   grid.wait();
   for (int eight = block; eight < KV_HEADS * EIGHTS; eight += BLOCKS) {
@@ -178,4 +189,39 @@ __device__ __forceinline__ void attend_by_warps(Grid& grid, const Args& args, fl
     }
     attend_eight(args, smem, of, keys, values, eight, total, length, attended_times);
   }
+}
+
+// A layer across in one phase: a block makes a head's queries for up to 8 tokens, and attends with them. Of other blocks it
+// needs what q|k|v needs, the stream and its squares: keys and values are the prefix's. A warp has 16 of them at most.
+constexpr int S_HEAD_QUERIES = larger(S_PART_TOPS + WARPS * 16, S_WORK + QueriesShape::SUM_WORDS);  // [8][QUERIES_ROW]
+static_assert(!ACROSS_AT_ONCE || (BY_WARPS && QueriesShape::PARTIES * QueriesShape::RANGES <= BLOCKS), "blocks");
+static_assert(!ACROSS_AT_ONCE || (S_HEAD_QUERIES + 8 * QUERIES_ROW) * 4 <= TP_SHARED_BYTES, "too little shared memory");
+
+__device__ __forceinline__ void attend_across(Grid& grid, const Args& args, float* smem, int layer, int length,
+                                              const byte* weights, const Normed& normed, float attended_times) {
+  Product<QueriesShape> product(weights);
+  product.ask();
+  const bool busy = product.first < product.end;
+  const int head = min(product.first / FinishQueries::HEAD_TILES, HEADS - 1);
+  const long long at = layer * args.layer_stride + head / GROUP * HEAD_STRIDE;
+  const Keys keys{args.cache_k + at, nullptr, length}, values{args.cache_v + at, nullptr, length};
+  OfWarp<1> of;
+  ask_of_warp<true>(product.thread, of, keys, values, busy ? length : 0);
+  unsigned short* const made = (unsigned short*)(smem + S_HEAD_QUERIES);
+  FinishQueries finish{{normed, (const float2*)args.rope + T * HD / 2}, made, product.from()};
+  InverseRms<QueriesShape> inverse_rms{args, smem};
+  product.run(grid, smem, args.stream, finish, inverse_rms);
+  if (!busy) return;
+  __syncthreads();
+  const int thread = thread_of_phase(), g = thread % 32 / 4, from = product.from(), tokens = min(T - from, QueriesShape::RANGE);
+  uint4 queries[LOGIT_STEPS];
+#pragma unroll
+  for (int i = 0; i < LOGIT_STEPS; ++i) {
+    queries[i] = make_uint4(0, 0, 0, 0);
+    if (g < tokens && i * 32 + thread % 4 * 8 < HD)
+      queries[i] = *(const uint4*)(smem + S_HEAD_QUERIES + g * QUERIES_ROW + i * 16 + thread % 4 * 4);
+  }
+  weigh_of_warp(thread, LOG2_E * args.logit_scale, smem, of, queries, length);
+  __syncthreads();
+  combine_warps(thread, args, smem, attended_times, [&](int row) { return Row{from + row, head, row < tokens}; });
 }

@@ -78,10 +78,9 @@ struct Normed {
 };
 
 // q|k|v. A tile of queries or keys has RoPE's partners side by side: pair p of it are columns 4 t + p and HD / 2 more.
-struct FinishQkv {
+struct Turned {
   Normed normed;
   const float2* rope;  // [T][HD / 2] cosine, sine
-  unsigned short *queries, *keys, *values;
   static constexpr int HEAD_TILES = HD / 8;
   struct Factors {
     Normed::Factors normed;
@@ -93,6 +92,12 @@ struct FinishQkv {
       f.rope = __ldg(rope + i.token * (HD / 2) + i.tile % HEAD_TILES * 4 + i.pair);
     return f;
   }
+  __device__ __forceinline__ static u32 turned(Factors f, float2 v) {
+    return pack(v.x * f.rope.x - v.y * f.rope.y, v.y * f.rope.x + v.x * f.rope.y);
+  }
+};
+struct FinishQkv : Turned {
+  unsigned short *queries, *keys, *values;
   __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
     if (!i.valid) return;
     const float2 v = normed.apply(i, f.normed, sum);
@@ -102,10 +107,21 @@ struct FinishQkv {
       *(u32*)(values + row * HD + i.tile % HEAD_TILES * 8 + i.pair * 2) = pack(v.x, v.y);
       return;
     }
-    const u32 both = pack(v.x * f.rope.x - v.y * f.rope.y, v.y * f.rope.x + v.x * f.rope.y);
+    const u32 both = turned(f, v);
     unsigned short* const to =
         (head < HEADS ? queries + (head / GROUP * ROWS + i.token * GROUP + head % GROUP) * HD : keys + ((head - HEADS) * T + i.token) * HD) +
         i.tile % HEAD_TILES * 4 + i.pair;
+    to[0] = both, to[HD / 2] = both >> 16;
+  }
+};
+// Queries of one head, to shared memory.
+struct FinishQueries : Turned {
+  unsigned short* queries;  // of the block's first token
+  int from;
+  __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
+    if (!i.valid) return;
+    const u32 both = turned(f, normed.apply(i, f.normed, sum));
+    unsigned short* const to = queries + (i.token - from) * QUERIES_ROW * 2 + i.tile % HEAD_TILES * 4 + i.pair;
     to[0] = both, to[HD / 2] = both >> 16;
   }
 };

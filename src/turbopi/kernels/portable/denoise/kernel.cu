@@ -13,8 +13,9 @@
 //            which down has read
 // mix: product.run; arrive
 //   guards   hidden. Where the time is mixed into the tokens
-// qkv: product.run; arrive
-//   guards   stream and squares, of embed or down
+// qkv: attend_across; arrive; product.run; arrive
+//   guards   stream and squares, of embed or down. Across at once, `attend_across` is this phase and the next one: it waits in
+//            its product, and arrives for both
 // attention: attend; arrive
 //   guards   queries, keys, values. Of narrow heads `attend_by_warps`, which waits as `attend` does
 // combine: wait; combine; arrive
@@ -42,6 +43,8 @@
 //   guards   parts of warps, and what they found: written before they are put together
 // attend_by_warps: 1
 //   guards   the same, before the next rows
+// attend_across: 2
+//   guards   S_HEAD_QUERIES, and the product's sums, whose room parts take; parts, as above
 
 // action_in_proj of x_t, and the stream of the first norm: each block the columns that it keeps. Where the time is mixed
 // into the tokens, the hidden units of that MLP: its first matrix is multiplied with action_in_proj already.
@@ -140,6 +143,11 @@ __device__ __forceinline__ void ends_ahead(const float* from, int count) {
   for (int at = (blockIdx.x * THREADS + threadIdx.x) * 32; at < count; at += BLOCKS * THREADS * 32) to_l2(from + at);
 }
 
+// By how much attention's outputs are multiplied.
+__device__ __forceinline__ float attended_times_of(const Args& args, int layer) {
+  return FP8 ? __ldg(args.attended_times + layer) : 1.0f;
+}
+
 // In front of the loop: RoPE's tables of the suffix's positions, x_0, and the barrier's counter.
 extern "C" __global__ void __launch_bounds__(256) turbopi_portable_denoise_prepare(const Args args) {
   const int at = blockIdx.x * 256 + threadIdx.x;
@@ -181,29 +189,35 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
       const float* const norms = table + layer * 6 * D;  // scale, shift, gate before attention; before the feed-forward
       const float* const shifted = args.shifted + ((MODULATED ? (long long)step * L : 0) + layer) * (QKV_ROWS + 2 * F);
       const float* const scales = args.row_scales + (SCALED ? layer * (QKV_ROWS + 2 * F) : 0);
-      {
-        Product<QkvShape> product(weights + QKV_AT, is_self(layer) ? QkvShape::TILES : HEADS * HD / 8);
-        product.ask();
-        FinishQkv finish{{shifted, scales, smem + S_RMS},
-                         (const float2*)args.rope + (is_self(layer) ? 0 : T * HD / 2),
-                         (unsigned short*)args.queries,
-                         (unsigned short*)args.keys,
-                         (unsigned short*)args.values};
-        InverseRms<QkvShape> inverse_rms{args, smem};
-        product.run(grid, smem, args.stream, finish, inverse_rms);
-      }
-      grid.arrive();
-      ahead<GateUpShape>(weights + GATE_UP_AT);
-      const float attended_times = FP8 ? __ldg(args.attended_times + layer) : 1.0f;
-      if (BY_WARPS)
-        attend_by_warps(grid, args, smem, layer, length, attended_times);
-      else
-        attend(grid, args, smem, layer, length, attended_times);
-      grid.arrive();
-      if (COMBINES) {
-        grid.wait();
-        combine(args, attended_times);
+      const Normed normed{shifted, scales, smem + S_RMS};
+      if (ACROSS_AT_ONCE && !is_self(layer)) {
+        attend_across(grid, args, smem, layer, length, weights + QKV_AT, normed, attended_times_of(args, layer));
+        grid.arrive(2);
+        ahead<GateUpShape>(weights + GATE_UP_AT);
+      } else {
+        {
+          Product<QkvShape> product(weights + QKV_AT, is_self(layer) ? QkvShape::TILES : HEADS * HD / 8);
+          product.ask();
+          FinishQkv finish{{normed, (const float2*)args.rope + (is_self(layer) ? 0 : T * HD / 2)},
+                           (unsigned short*)args.queries,
+                           (unsigned short*)args.keys,
+                           (unsigned short*)args.values};
+          InverseRms<QkvShape> inverse_rms{args, smem};
+          product.run(grid, smem, args.stream, finish, inverse_rms);
+        }
         grid.arrive();
+        ahead<GateUpShape>(weights + GATE_UP_AT);
+        const float attended_times = attended_times_of(args, layer);
+        if (BY_WARPS)
+          attend_by_warps(grid, args, smem, layer, length, attended_times);
+        else
+          attend(grid, args, smem, layer, length, attended_times);
+        grid.arrive();
+        if (COMBINES) {
+          grid.wait();
+          combine(args, attended_times);
+          grid.arrive();
+        }
       }
       {
         Product<OutShape> product(weights + OUT_AT);

@@ -56,6 +56,8 @@ class Choices:
     activations: int  # the same of activations, in groups of 8 tokens
     ahead: bool  # weights of later phases go to L2, where L2 is large
     ranges: int = 1  # of tokens: a block has tiles of a product for one of them
+    wide_ranges: int = 1  # the same of q|k|v and gate|up, which have more channels
+    across_at_once: bool = False  # across, a block makes a head's queries for up to 8 tokens and attends with them
 
 
 FEW = Choices(warps=16, sums=8, weights=8, activations=8, ahead=True)  # up to 16 tokens
@@ -64,7 +66,10 @@ MANY = Choices(warps=8, sums=16, weights=8, activations=14, ahead=True)
 
 NARROW = Choices(warps=16, sums=8, weights=8, activations=7, ahead=True)  # of SmolVLA's width
 # The same on a GPU of as many multiprocessors as an H200: on fewer a block has so many tiles that addresses are spilled
-IN_RANGES, MANY_BLOCKS = Choices(warps=16, sums=8, weights=12, activations=8, ahead=True, ranges=2), 132
+IN_RANGES = Choices(
+    warps=16, sums=4, weights=12, activations=8, ahead=True, ranges=2, wide_ranges=4, across_at_once=True
+)
+MANY_BLOCKS = 132
 
 
 def choices(suffix: int, form: Form = PI05, blocks: int = 0) -> Choices:
@@ -139,6 +144,9 @@ def kernel_sizes(
     splits = max(min(blocks // row_tiles, MAX_SPLITS), 1, -(-keys // MAX_SPLIT_KEYS))
     if g.head_dim <= 64 and keys <= MAX_WHOLE_KEYS:
         splits = 1  # a share takes less time than the phase that would put several together
+    # Across at once, a warp has 16 keys and a block up to 8 tokens of a head
+    enough = cache_rows <= choice.warps * 16 and g.num_heads * -(-suffix // 8) <= blocks
+    at_once = choice.across_at_once and form.self_every != 1 and g.head_dim <= 64 and splits == 1 and enough
     key_tiles = -(-keys // 8)
     split_keys = -(-key_tiles // splits) * 8
     return {
@@ -149,11 +157,13 @@ def kernel_sizes(
         "TP_WEIGHTS_IN_FLIGHT": choice.weights,
         "TP_ACTIVATIONS_IN_FLIGHT": choice.activations,
         "TP_RANGES": choice.ranges,
+        "TP_WIDE_RANGES": choice.wide_ranges,
         "TP_AHEAD": int(choice.ahead),
         "TP_KV_HEADS": g.num_kv_heads,
         "TP_CACHE_ROWS": cache_rows if g.num_kv_heads > 1 else 0,
         "TP_MODULATED": int(form.modulated),
         "TP_SELF_EVERY": form.self_every,
+        "TP_ACROSS_AT_ONCE": int(at_once),
         "TP_CAUSAL": int(form.causal),
         "TP_SILU": int(form.silu),
         "TP_SPLITS": splits,

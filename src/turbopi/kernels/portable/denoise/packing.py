@@ -3,7 +3,7 @@
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -141,7 +141,7 @@ class PackedExpert:
     def pack(
         cls,
         config: Expert,
-        layers: Sequence[GemmaLayer],
+        layers: Iterable[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
         format: Format = FP8,
@@ -158,10 +158,11 @@ class PackedExpert:
         if reason is not None:
             raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
         scales, of_inputs = [], []
-        device = device or layers[0].qkv.device
-        weights = torch.empty(0, device=device)
-        orders = [None if order is None else order.to(device) for order in _orders(config.expert)]
-        for i, layer in enumerate(layers):
+        depth, orders, weights = config.expert.depth, list(_orders(config.expert)), torch.empty(0)
+        for i, layer in zip(range(depth), layers, strict=True):
+            if i == 0:
+                device = device or layer.qkv.device
+                orders = [None if order is None else order.to(device) for order in orders]
             parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             places = [f"expert.{i}.{kind}" for kind in KINDS]
             if inputs is not None:
@@ -174,9 +175,9 @@ class PackedExpert:
                 parts = [part.to(torch.bfloat16) for part in parts]
             ordered = [m if order is None else m[order] for m, order in zip(parts, orders, strict=True)]
             flat = torch.cat([tiles(m) for m in ordered])
-            weights = flat.new_empty(len(layers), len(flat)) if i == 0 else weights
+            weights = flat.new_empty(depth, len(flat)) if i == 0 else weights
             weights[i] = flat
-        none = torch.empty(len(layers), 0, device=weights.device)
+        none = torch.empty(depth, 0, device=weights.device)
         return cls(
             config,
             weights if inputs is None else weights.view(format.dtype),

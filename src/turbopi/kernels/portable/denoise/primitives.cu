@@ -32,11 +32,12 @@ struct Grid {
       : counter(args.counter), trace(args.trace), hang(args.hang), expected(0) {
     if (TP_TRACE) last = clock64();
   }
-  __device__ __forceinline__ void arrive() {
+  // phases: as many as were one, so that a barrier's number says where it is
+  __device__ __forceinline__ void arrive(int phases = 1) {
     __syncthreads();
     if (TP_TRACE) note(0);
-    expected += BLOCKS;
-    if (threadIdx.x == 0) asm volatile("red.release.gpu.global.add.u32 [%0], %1;" ::"l"(counter), "r"(1) : "memory");
+    expected += phases * BLOCKS;
+    if (threadIdx.x == 0) asm volatile("red.release.gpu.global.add.u32 [%0], %1;" ::"l"(counter), "r"(phases) : "memory");
   }
   __device__ __forceinline__ void wait() {
     if (threadIdx.x == 0) {

@@ -31,7 +31,7 @@ struct Product {
     weights = all + thread % 32 * 16;
     const int block = block_of_phase(), party = block / S::RANGES;
     first = first_tile<S>(party, tiles, S::PARTIES), end = first_tile<S>(party + 1, tiles, S::PARTIES);
-    if (S::LEFT_OUT && party == S::PARTIES) end = first;
+    if (S::LEFT_OUT && party >= S::PARTIES) end = first;
   }
   // The first token. A member that is 0 costs sm_80's kernels registers
   __device__ __forceinline__ int from() const { return S::RANGES > 1 ? blockIdx.x % S::RANGES * S::RANGE : 0; }

@@ -11,6 +11,7 @@
 //   gate|up    stream x weights, 1 / rms, shift, GeGLU or SwiGLU  -> hidden
 //   down       hidden x weights, gate, residual                   -> x, and the stream of the next norm
 //
+// Of a layer across q|k|v and attention are one phase where blocks and warps are enough (`attend_across`): a barrier less.
 // A step adds one phase in front (action_in_proj; where the time is mixed into the tokens, the hidden units of that MLP and
 // a product behind them) and one behind (final norm, action_out_proj, Euler step).
 //
@@ -36,6 +37,7 @@ constexpr int SELF_EVERY = TP_SELF_EVERY;  // so many-th layers attend to the su
 constexpr bool ACROSS = SELF_EVERY != 1;   // whether there are such others
 constexpr bool CAUSAL = TP_CAUSAL;         // a token of the suffix sees those before it and itself
 constexpr bool MODULATED = TP_MODULATED;   // a step has norms' weights of its own; else the time is mixed into the tokens
+constexpr bool ACROSS_AT_ONCE = TP_ACROSS_AT_ONCE;  // across, q|k|v and attention are one phase
 constexpr int BLOCKS = TP_BLOCKS, WARPS = TP_WARPS, THREADS = WARPS * 32;
 constexpr u32 LOOKS = TP_LOOKS;
 constexpr bool FP8 = TP_FP8, INT8 = TP_INT8;  // INT8: weights alone, which become bfloat16 in registers, exactly
@@ -68,15 +70,15 @@ constexpr __host__ __device__ int power_of_two(int up_to, int limit) {  // the l
 }
 
 // A product's shape and how warps share it out. RANGES_: tokens are cut into so many; a block has tiles for one of them.
-template <int CHANNELS_, int COLUMNS_, int RANGES_ = 1>
+// PARTIES_: of blocks with the same tiles. IN_FLIGHT_: loads of weights that a lane has on their way, at most.
+template <int CHANNELS_, int COLUMNS_, int RANGES_ = 1, int PARTIES_ = BLOCKS / RANGES_, int IN_FLIGHT_ = TP_WEIGHTS_IN_FLIGHT>
 struct Shape {
   static constexpr int TILES = CHANNELS_ / 8;
   static constexpr int CHUNKS = (COLUMNS_ + CHUNK - 1) / CHUNK;
   static constexpr int RANGES = RANGES_, RANGE = (T + RANGES - 1) / RANGES;        // tokens
   static constexpr int GROUPS = (RANGE + 7) / 8, M_TILES = (RANGE + 15) / 16;      // of 8 and of 16 of them
-  static constexpr int PARTIES = BLOCKS / RANGES;                                  // of blocks with the same tiles
-  static constexpr bool LEFT_OUT = BLOCKS % RANGES > 0;                            // a block that has none
-  static constexpr int BLOCK_TILES = (TILES + PARTIES - 1) / PARTIES;              // of a block at most
+  static constexpr int PARTIES = PARTIES_, BLOCK_TILES = (TILES + PARTIES - 1) / PARTIES;  // of a block at most
+  static constexpr bool LEFT_OUT = PARTIES * RANGES < BLOCKS;                      // blocks that have none
   static constexpr int TILE_ROOM = TP_SUMS / M_TILES;                // of a warp, by its registers for sums
   static constexpr int WN_WANTED = (BLOCK_TILES + TILE_ROOM - 1) / TILE_ROOM;
   static constexpr int WN = WN_WANTED <= 1 ? 1 : WN_WANTED <= 2 ? 2 : 4;
@@ -87,17 +89,19 @@ struct Shape {
   static constexpr int PASSES = (BLOCK_TILES + PASS_TILES - 1) / PASS_TILES;
   static constexpr int WARP_CHUNKS = (CHUNKS + WK - 1) / WK;
   static constexpr int LOADS = WARP_CHUNKS * WARP_TILES;  // of a lane, in a pass
-  static constexpr int IN_FLIGHT = divisor(LOADS, TP_WEIGHTS_IN_FLIGHT);
+  static constexpr int IN_FLIGHT = divisor(LOADS, IN_FLIGHT_);
   static constexpr int A_ROOM = TP_ACTIVATIONS_IN_FLIGHT / (GROUPS * PIECES), A_WANTED = A_ROOM < 1 ? 1 : A_ROOM;
   static constexpr int A_IN_FLIGHT = A_WANTED < WARP_CHUNKS ? A_WANTED : WARP_CHUNKS;  // chunks
   static constexpr int SUM_ROWS = RANGES > 1 ? RANGE : GROUPS * 8, SUM_WORDS = WK * PASS_TILES * SUM_ROWS * 8;
   static constexpr long long BYTES = (long long)TILES * CHUNKS * CHUNK_BYTES;
 };
-using QkvShape = Shape<QKV_ROWS, D, TP_RANGES>;
+using QkvShape = Shape<QKV_ROWS, D, TP_WIDE_RANGES>;
 using OutShape = Shape<D, HEADS * HD, TP_RANGES>;
-using GateUpShape = Shape<2 * F, D, TP_RANGES>;
+using GateUpShape = Shape<2 * F, D, TP_WIDE_RANGES>;
 using DownShape = Shape<D, F, TP_RANGES>;
 using MixShape = Shape<D, D, TP_RANGES>;
+// Across at once: a block has a head for up to 8 tokens. Keys and values are on their way beside the weights: half as many
+using QueriesShape = Shape<HEADS * HD, D, (T + 7) / 8, HEADS, TP_WEIGHTS_IN_FLIGHT / 2>;
 using EmbedShape = Shape<D, F>;  // how a step's first phase shares out columns
 constexpr long long QKV_AT = 0, OUT_AT = QkvShape::BYTES, GATE_UP_AT = OUT_AT + OutShape::BYTES;
 constexpr long long DOWN_AT = GATE_UP_AT + GateUpShape::BYTES, LAYER_BYTES = DOWN_AT + DownShape::BYTES;
