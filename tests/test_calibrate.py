@@ -466,6 +466,9 @@ def test_a_file_for_int8_says_so_and_one_for_fp8_is_read_by_older_turbo_pis(tmp_
     assert not fp8.plan(TINY, "fp8").kept, "whose NaN stays one"
     vision = read.only(["vision"]).plan(TINY, "int8")
     assert vision.kept["prefix.0.qkv"] == "INT8 is switched off in the prefix" and vision.expert == "bf16"
+    without = plan.without_expert("as I say")
+    assert plan.expert == "int8" and without.expert == "bf16" and without.kept["expert.0.qkv"] == "as I say"
+    assert without.scales.keys() == {site for site in plan.scales if not site.startswith("expert.")}
     for numbers in ("int4", 8):
         (tmp_path / "q.json").write_text(json.dumps(int8.as_json() | {"numbers": numbers}))
         with pytest.raises(CalibrationError, match=r"numbers .* should be one of fp8, int8"):

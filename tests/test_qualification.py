@@ -92,14 +92,14 @@ def test_the_faster_one_that_is_right_is_taken_and_it_is_found_out_once(child: C
     assert backends.choose(GPU, "bf16", MODEL)[0] == "cuda_graph"
 
 
-def test_int8_is_qualified_with_the_kernels_for_all_gpus_on_hopper_too(
+def test_hoppers_kernels_are_qualified_in_every_precision(
     child: Child, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     properties = SimpleNamespace(name="NVIDIA H20", major=9, minor=0, multi_processor_count=78, total_memory=96 << 30)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     monkeypatch.delenv("TURBOPI_KERNELS", raising=False)
     kernels = [qualification.about(GPU, one, MODEL)["kernels"] for one in ("bf16", "fp8", "int8")]
-    assert kernels == ["hopper", "hopper", "portable"]
+    assert kernels == ["hopper"] * 3
 
 
 @pytest.mark.parametrize("what", ["_driver", "_kernels_hash", "_versions"])
