@@ -318,6 +318,34 @@ def test_int8s_largest_sums_and_parts_are_exact() -> None:
 
 
 @on_hopper
+@pytest.mark.parametrize(("heads", "head_dim"), [(2, 24), (16, 72), (8, 256)])
+@pytest.mark.parametrize(("tokens", "images"), [(50, 2), (256, 2), (256, 16)])
+def test_attention_of_hopper_leaves_in_int8_and_marks_damage(
+    tokens: int, images: int, heads: int, head_dim: int
+) -> None:
+    """A value that isn't finite damages all that see it: an image's tokens; of a prefix those whose head it is."""
+    qkv, stream = random(images * tokens, 3 * heads * head_dim), random(images * tokens, 8)
+    to = {"inverse": 40.0, "numbers": torch.int8}
+    attend = attention_hopper.vision_attention
+    exact = plain.vision_attention(qkv.float(), images, heads)
+    ours = attend(qkv, images, heads, 40.0, numbers=torch.int8, stream=stream)
+    assert ours.dtype == torch.int8 and bool(stream.isfinite().all())
+    assert int((ours.int() - plain.as_input(exact, DTYPE, **to).int()).abs().max()) <= 1  # type: ignore[arg-type]
+    qkv[3, -1] = torch.nan  # a value of the last head, in the first image
+    attend(qkv, images, heads, 40.0, numbers=torch.int8, stream=stream)
+    assert stream[:, 0].isnan().tolist() == [True] * tokens + [False] * (images - 1) * tokens
+    assert bool(stream[:, 1:].isfinite().all())
+
+    q, k, v, length = random(80 * heads, head_dim), random(80, head_dim), random(80, head_dim), torch.tensor([77])
+    exact = plain.attention(q.float(), k.float(), v.float(), length.to(DEVICE), 80, heads)
+    ours = attention_hopper.prefix_attention(q, k, v, length.to(DEVICE), heads, 40.0, numbers=torch.int8)
+    assert int((ours.int() - plain.as_input(exact, DTYPE, **to).int()).abs().max()) <= 1  # type: ignore[arg-type]
+    q[5 * heads + 1] = torch.inf  # a query of the sixth token
+    attention_hopper.prefix_attention(q, k, v, length.to(DEVICE), heads, 40.0, numbers=torch.int8)
+    assert v[:, 0].isnan().nonzero().flatten().tolist() == [5]
+
+
+@on_hopper
 @pytest.mark.parametrize("epilogue", ["gelu", "geglu"])
 def test_what_int8_cannot_hold_is_marked_in_its_row(epilogue: Epilogue) -> None:
     """Of a channel that is damaged in every row; of one whose sums are 0 but where its row isn't."""

@@ -25,7 +25,6 @@ from turbopi.kernels.portable.gemm.kernel import gpu, product  # noqa: E402
 from turbopi.kernels.portable.gemm.tiles import Capability, Epilogue, Tile  # noqa: E402
 from turbopi.kernels.portable.ops import attend, portable_ops  # noqa: E402
 from turbopi.kernels.portable.quantize import quantize  # noqa: E402
-from turbopi.kernels.portable.rounding import round_rows_to_int8  # noqa: E402
 from turbopi.kernels.tile_table import LIBRARY, TileKey, TileTable  # noqa: E402
 from turbopi.quantization.formats import FP8, INT8, Format  # noqa: E402
 from turbopi.quantization.fp8 import E4M3_MAX, ScaledMatrix, to_e4m3  # noqa: E402
@@ -215,7 +214,6 @@ def test_whatever_stands_before_a_product_leaves_in_its_numbers(format: Format) 
         (norms.residual_rms_norm(*norm, **to)[1], plain.residual_rms_norm(*norm, **to)[1]),
         (norms.residual_layer_norm(*layer_norm, **to)[1], plain.residual_layer_norm(*layer_norm, **to)[1]),
         (attention.vision_attention(*camera_images, **to), plain.vision_attention(*camera_images, **to)),
-        *([(round_rows_to_int8(x, to["inverse"]), plain.as_input(x, DTYPE, **to))] if format is INT8 else []),
         (attend(*prefix, **to), plain.attention(*prefix, **to)),
     ):
         assert ours.dtype == stored(format) and reference.dtype == format.dtype
@@ -260,7 +258,6 @@ def test_damage_that_int8_cannot_hold_shows_in_its_row_of_the_stream(damage: flo
         theirs = partial(reference, *given, **to)
         assert marked(ours) == marked(lambda s, theirs=theirs: theirs(stream=s)) == rows  # type: ignore[misc]
     assert marked(lambda s: activations.geglu(x, **to, stream=s)) == [3]
-    assert marked(lambda s: round_rows_to_int8(x, 30.0, s)) == [3]
     for attended in (attention.vision_attention, plain.vision_attention):
         assert marked(lambda s, attended=attended: attended(qkv, 2, 2, **to, stream=s)) == [0, 1, 2, 3]  # type: ignore[misc]
     for normed in (norms.residual_rms_norm, plain.residual_rms_norm):

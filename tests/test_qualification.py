@@ -92,9 +92,7 @@ def test_the_faster_one_that_is_right_is_taken_and_it_is_found_out_once(child: C
     assert backends.choose(GPU, "bf16", MODEL)[0] == "cuda_graph"
 
 
-def test_hoppers_kernels_are_qualified_in_every_precision(
-    child: Child, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hoppers_kernels_are_qualified_in_every_precision(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
     properties = SimpleNamespace(name="NVIDIA H20", major=9, minor=0, multi_processor_count=78, total_memory=96 << 30)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     monkeypatch.delenv("TURBOPI_KERNELS", raising=False)

@@ -12,8 +12,7 @@ from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.ops import portable_ops
-from turbopi.kernels.sm90.int8 import with_int8
-from turbopi.kernels.sm90.ops import hopper_ops
+from turbopi.kernels.sm90.ops import hopper_ops, in_int8
 from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
 from turbopi.support.errors import ConfigError
 
@@ -64,7 +63,7 @@ def fused_ops(
     on_hopper = hopper_kernels(device, without)
     ops = ops_of("hopper" if on_hopper else "portable", device, tiles)
     if on_hopper and precision == "int8":
-        ops = with_int8(ops, tiles)
+        ops = in_int8(ops)
     instead: dict[str, Any] = {one.name: getattr(BESIDE, one.name) for one in fields(Ops) if one.name in without}
     if not instead:
         return ops

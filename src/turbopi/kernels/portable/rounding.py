@@ -10,7 +10,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.quantization.fp8 import E4M3
 
 ROWS = 16  # of a program, one warp: a row's columns depend on each other, so rows are all there is to share
@@ -87,31 +86,6 @@ def _feedback_kernel(
         left += (rounded * scale - exact)[:, None] * error[None, :]
         tl.store(out + row * columns + at, stored, valid)
         at, exact = following, next_exact
-
-
-@triton.jit
-def _rows_kernel(x, out, inverse, width, residual, stride, MARKS: tl.constexpr, WIDTH: tl.constexpr, PDL: tl.constexpr):
-    row, column = tl.program_id(0).to(tl.int64), tl.arange(0, WIDTH)
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    given = tl.load(x + row * width + column, column < width, 0.0).to(tl.float32) * inverse
-    tl.store(out + row * width + column, as_stored(given, out), column < width)
-    if MARKS:
-        tl.store(residual + row * stride, float("nan"), damaged(given, 0))
-
-
-def round_rows_to_int8(x: Tensor, inverse: float, stream: Tensor | None = None) -> Tensor:
-    """int8[rows, width]: round(x * inverse) of bfloat16 x, with damage marked in `stream` [rows, …]. Contiguous.
-
-    Twin: `kernels.plain.as_input`.
-    """
-    rows, width = x.shape
-    assert x.is_contiguous() and (stream is None or len(stream) == rows)
-    out = torch.empty_like(x, dtype=torch.int8)
-    _rows_kernel[(rows,)](
-        x, out, inverse, width, WIDTH=triton.next_power_of_2(width), **marks(stream, out), **dependent_launch(x)
-    )
-    return out
 
 
 def marks(stream: Tensor | None, unused: Tensor) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.portable import attention as portable_attention
 from turbopi.kernels.portable import batch as portable_batch
+from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90 import instructions
@@ -24,6 +25,7 @@ from turbopi.kernels.sm90.norms import layer_norm
 from turbopi.kernels.sm90.vision import FusedVision
 from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.kernels.tile_table import NO_TILES, TileTable
+from turbopi.quantization.fp8 import E4M3
 
 
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
@@ -40,10 +42,10 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         "the expert with a way back": vjp.ORIGIN,
         "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
     }
-    norms = f"CUDA from {layer_norm.ROWS} rows on, else Triton"
+    whose = f"CUDA from {layer_norm.ROWS} rows on, else Triton"
     if instructions.multiprocessors(device) >= GATHERING_SMS:
-        norms = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, {norms}"
-    origin["LayerNorm"] = norms
+        whose = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, {whose}"
+    origin["LayerNorm"] = whose
     return replace(
         portable,
         residual_layer_norm=layer_norm.residual_layer_norm,
@@ -66,6 +68,17 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     )
 
 
+def in_int8(ops: Ops) -> Ops:
+    """These operations for weights of which some are in INT8 and none in E4M3.
+
+    LayerNorms aren't in products: an E4M3 copy of the stream may be 16 times larger than calibration saw it, and int8
+    has no room for that.
+    """
+    origin = {name: whose for name, whose in ops.origin.items() if name != "FP8 products"}
+    origin |= {"INT8 products": "CUDA, with bias, GELU, GeGLU and rounding in the epilogue", "LayerNorm": "Triton"}
+    return replace(ops, residual_layer_norm=norms.residual_layer_norm, vision=None, origin=origin)
+
+
 def _rows(tiles: Mapping[tuple[int, int, int], Tile | int], kind: type = Tile) -> str:
     return ", ".join(str(rows) for rows in sorted({rows for (rows, _, _), tile in tiles.items() if type(tile) is kind}))
 
@@ -79,11 +92,14 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if k.shape[0] == slots and attention.takes(q.shape[1]):  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads, inverse)
-    return attend_portably(q, k, v, length, slots, heads, *state_token, inverse=inverse, tiles=tiles)
+        return attention.prefix_attention(q, k, v, length, heads, inverse, numbers=numbers)
+    return attend_portably(
+        *(q, k, v, length, slots, heads), *state_token, inverse=inverse, numbers=numbers, tiles=tiles
+    )
 
 
 def packed_attention(
@@ -93,19 +109,27 @@ def packed_attention(
     segments: Segments,
     heads: int,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if attention.takes(q.shape[1]):
-        return attention.packed_attention(q, k, v, segments, heads, inverse)
-    return portable_batch.packed_attention(q, k, v, segments, heads, inverse, tiles=tiles)
+        return attention.packed_attention(q, k, v, segments, heads, inverse, numbers=numbers)
+    return portable_batch.packed_attention(q, k, v, segments, heads, inverse, numbers=numbers, tiles=tiles)
 
 
 def vision_attention(
-    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tiles: TileTable = NO_TILES
+    qkv: Tensor,
+    images: int,
+    heads: int,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
+    given: dict[str, Any] = {"numbers": numbers, "stream": stream}
     if attention.takes(qkv.shape[1] // 3 // heads):
-        return attention.vision_attention(qkv, images, heads, inverse)
-    return portable_attention.vision_attention(qkv, images, heads, inverse, tiles=tiles)
+        return attention.vision_attention(qkv, images, heads, inverse, **given)
+    return portable_attention.vision_attention(qkv, images, heads, inverse, **given, tiles=tiles)
 
 
 def suffix_attention(

@@ -25,6 +25,20 @@ static_assert(1 <= WGS && WGS <= 4, "setmaxnreg waits for registers that a multi
 
 #define NONE __uint_as_float(0xff800000)  // -inf
 
+// TP_OUT_INT8, beside TP_OUT_FP8: results of whole numbers. What they can't hold is marked: the first of `pitch` bfloat16
+// numbers becomes NaN, of which there is a row for `of` rows of results; `first` is that of the warp's first row.
+#if TP_OUT_INT8
+struct Marks {
+    u16* rows;
+    int pitch, of;
+    size_t first;
+};
+#define MARKS(first) Marks{marked, mark_pitch, marks_of, (size_t)(first)}
+#else
+struct Marks {};
+#define MARKS(first) Marks{}
+#endif
+
 // 64 columns of some rows of one head
 __device__ __forceinline__ void load(u32 to, const TensorMap* map, int column, int head, int row, u32 bar) {
     asm volatile(
@@ -181,15 +195,23 @@ __device__ __forceinline__ bool any_shrinks(float2 by) { return __any_sync(~0u, 
 // the warp's 16 rows; `pitch` numbers from row to row. Rows from `there` on aren't written.
 template <typename Mine>
 __device__ __forceinline__ void store_rows(
-    const float (&sums)[DIM / 2], const float (&total)[2], float inverse, Element* out, size_t pitch, int there, Mine mine) {
+    const float (&sums)[DIM / 2], const float (&total)[2], float inverse, Element* out, size_t pitch, int there, Mine mine,
+    Marks marks) {
     const int lane = threadIdx.x % 32;
 #pragma unroll
     for (int half = 0; half < 2; ++half) {
         const int at = lane / 4 + half * 8;
         Element* const to = out + at * pitch;
         const float factor = (OUT_FP8 ? inverse : 1.0f) / total[half];
+#if TP_OUT_INT8
+        bool damaged = false;
+#endif
         auto value = [&](int j) -> u32 {
             const float x = sums[4 * j + 2 * half] * factor, y = sums[4 * j + 2 * half + 1] * factor;
+#if TP_OUT_INT8
+            damaged |= !(fabsf(x) < -NONE && fabsf(y) < -NONE);
+            return pack_int8(x, y);
+#endif
             return OUT_FP8 ? pack_e4m3(x, y) : pack(x, y);
         };
 #pragma unroll
@@ -212,5 +234,8 @@ __device__ __forceinline__ void store_rows(
                 else *(u32*)here = v;
             }
         }
+#if TP_OUT_INT8
+        if (damaged && at < there) marks.rows[(marks.first + at) / marks.of * marks.pitch] = 0x7fff;
+#endif
     }
 }

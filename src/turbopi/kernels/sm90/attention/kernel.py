@@ -21,17 +21,21 @@ from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
+from turbopi.quantization.fp8 import E4M3
 
 PARAMETERS = Parameters(
     (
         *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
-        Parameter("Element*", "out"),  # bfloat16 or E4M3: common.cu
+        Parameter("Element*", "out"),  # bfloat16, E4M3 or int8: common.cu
         Parameter("const long long*", "length"),
         *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles", "units")),
         Parameter("float", "scale"),
         Parameter("float", "inverse"),
         Parameter("const int4*", "segments", "packed rows: see `kernels.interface.Segments`"),
     )
+)
+PARAMETERS_INT8 = Parameters(
+    (*PARAMETERS.all, Parameter("u16*", "marked"), Parameter("int", "mark_pitch"), Parameter("int", "marks_of"))
 )
 
 
@@ -88,18 +92,20 @@ def prefix_attention(
     heads: int,
     inverse: float | None = None,
     tile: AttentionTile | None = None,
+    *,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
-    k, v [keys, K]; what lies beyond `length` has no influence. With `inverse` the result leaves as E4M3. All bfloat16
-    and contiguous.
+    k, v [keys, K]; what lies beyond `length` has no influence. With `inverse` the result leaves as `numbers`, E4M3 or
+    int8, whose damage is marked in `v`. All bfloat16 and contiguous.
     """
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     assert length.dtype == torch.int64 and length.numel() == 1
     rows, dim = q.shape
     tile = tile or AttentionTile(dim, keys=64)
-    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse)
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
+    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse, marked=v)
     return out
 
 
@@ -111,31 +117,44 @@ def packed_attention(
     heads: int,
     inverse: float | None = None,
     tile: AttentionTile | None = None,
+    *,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
-    """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K] -> [R, n * K]; `inverse` as above."""
+    """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K] -> [R, n * K]; `inverse`, `numbers` as
+    above.
+    """
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     assert segments.tiles.is_contiguous() and segments.tiles.dtype == torch.int32 and segments.tiles.shape[1] == 4
     rows, dim = q.shape
-    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
     tile = tile or AttentionTile(dim, keys=80, wide=True)
-    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, None, rows, k.shape[0], 1, inverse, segments.tiles)
+    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, None, rows, k.shape[0], 1, inverse, segments.tiles, marked=v)
     return out
 
 
 def vision_attention(
-    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: AttentionTile | None = None
+    qkv: Tensor,
+    images: int,
+    heads: int,
+    inverse: float | None = None,
+    tile: AttentionTile | None = None,
+    *,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
 ) -> Tensor:
     """Self-attention inside each image: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
-    bfloat16, contiguous. With `inverse` the result leaves as E4M3.
+    bfloat16, contiguous. With `inverse` the result leaves as `numbers`, E4M3 or int8, whose damage is marked in
+    `stream` [V * tokens, …] or, without one, in the rows' first query.
     """
     assert qkv.is_contiguous() and qkv.dtype == torch.bfloat16
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     tokens, dim = rows // images, width // heads
-    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
+    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse, numbers))
     tile = tile or _vision_tile(tokens, dim, images * heads, instructions.multiprocessors(qkv.device))
     places = (3 * heads,) * 3
-    _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
+    given = tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse
+    _launch(*given, marked=qkv if stream is None else stream)
     return out
 
 
@@ -172,10 +191,13 @@ def _launch(
     groups: int,
     inverse: float | None,
     segments: Tensor | None = None,
+    *,
+    marked: Tensor,
 ) -> None:
     """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of images and heads.
 
-    rows and keys: of one image. `segments` int32[blocks, 4]: of packed rows.
+    rows and keys: of one image. `segments` int32[blocks, 4]: of packed rows. marked bfloat16[tokens, …]: where int8's
+    damage shows.
     """
     packed = segments is not None
     count = out.shape[-1] // tile.dim if length is None and not packed else 1  # query heads beside each other
@@ -193,7 +215,8 @@ def _launch(
     assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
     units = tiles * groups
     whole = length is None and not packed and keys == tile.keys * tile.warpgroups
-    kernel = _kernel(tile, inverse is not None, whole, packed, out.device)
+    in_int8 = out.dtype == torch.int8
+    kernel = _kernel(tile, inverse is not None, whole, packed, in_int8, out.device)
     given = {
         **dict(zip(("map_q", "map_k", "map_v"), maps, strict=True)),
         "out": out.data_ptr(),
@@ -209,10 +232,16 @@ def _launch(
         "inverse": 1.0 if inverse is None else inverse,
         "segments": None if segments is None else segments.data_ptr(),
     }
+    if in_int8:
+        assert marked.dtype == torch.bfloat16 and len(marked) == len(out), "each token has a place for its damage"
+        of = out.numel() // (len(out) * tile.dim * count)  # rows of one token: its heads, or all beside each other
+        given |= {"marked": marked.data_ptr(), "mark_pitch": marked.stride(0), "marks_of": of}
     kernel.launch_dependent(min(units, kernel.max_clusters) if tile.wide else units, given)
 
 
-def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: bool = False) -> dict[str, int]:
+def constants(
+    tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: bool = False, in_int8: bool = False
+) -> dict[str, int]:
     """What the kernel is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
@@ -220,6 +249,7 @@ def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: b
         "TP_KEYS": tile.keys,
         "TP_STAGES": tile.stages,
         "TP_OUT_FP8": int(out_fp8),
+        "TP_OUT_INT8": int(in_int8),
         "TP_SHARING": tile.sharing,
         "TP_QUERIES": tile.queries,
         "TP_WHOLE": int(whole),
@@ -227,19 +257,22 @@ def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: b
     }
 
 
-def source(tile: AttentionTile) -> str:
+def source(tile: AttentionTile, in_int8: bool = False) -> str:
     """The kernel with the instructions for a tile."""
     logits = instructions.wgmma("mma_logits", tile.keys)
     values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
-    parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
+    parameters = f"#define ATTENTION_PARAMETERS {(PARAMETERS_INT8 if in_int8 else PARAMETERS).declarations}"
     files = [f"attention/{name}.cu" for name in ("common", "wide" if tile.wide else "narrow")]
     return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
 
 
 @MadeOnce
-def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, packed: bool, device: torch.device) -> DependentKernel:
+def _kernel(
+    tile: AttentionTile, out_fp8: bool, whole: bool, packed: bool, in_int8: bool, device: torch.device
+) -> DependentKernel:
+    takes = PARAMETERS_INT8 if in_int8 else PARAMETERS
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole, packed))
+        cubin = compile_cubin(source(tile, in_int8), "sm_90a", constants(tile, out_fp8, whole, packed, in_int8))
         return DependentKernel(
-            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.sharing
+            cubin, "attention", takes, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.sharing
         )

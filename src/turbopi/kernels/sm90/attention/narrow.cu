@@ -189,7 +189,7 @@ attention(ATTENTION_PARAMETERS) {
 
         const int at = row + warp * 16;
         store_rows(sums, softmax.total, inverse, out + ((size_t)(group * rows + at) * heads + head) * DIM, (size_t)heads * DIM,
-                   rows - at, [&](int block) { return owner(block) == warpgroup; });
+                   rows - at, [&](int block) { return owner(block) == warpgroup; }, MARKS(group * rows + at));
     }
     if (SHARING > 1) cluster_sync();  // what this CTA loads for the others may still be on its way
 }

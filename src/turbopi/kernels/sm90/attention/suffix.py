@@ -100,6 +100,7 @@ def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
         "TP_KEYS": tile.keys,
         "TP_STAGES": tile.stages,
         "TP_OUT_FP8": int(out_fp8),
+        "TP_OUT_INT8": 0,
         "TP_ROWS": tile.rows,
         "TP_RANKS": tile.ranks,
     }

@@ -163,6 +163,6 @@ attention(ATTENTION_PARAMETERS) {
         softmax.end();
         const int at = unit.row + 64 * warpgroup + 16 * warp;
         store_rows(sums, softmax.total, inverse, out + ((size_t)(unit.group * rows + at) * heads + unit.head) * DIM,
-                   (size_t)heads * DIM, unit.end_of_rows - at, [](int) { return true; });
+                   (size_t)heads * DIM, unit.end_of_rows - at, [](int) { return true; }, MARKS(unit.group * rows + at));
     }
 }
