@@ -148,8 +148,11 @@ def test_what_such_a_folder_cannot_do_is_refused_by_name(tiny: Path, tmp_path: P
 
 
 def test_the_policy_takes_the_folders_precision_unless_another_is_given(tiny: Path) -> None:
-    with pytest.raises(BackendUnavailable, match=r"can't run on cpu.*emulated_int8'.*keeps its weights in int8 alone"):
+    only = "can't run on cpu: int8 needs an NVIDIA GPU of compute capability 8.x, 9.0 or 12.x. "
+    with pytest.raises(BackendUnavailable, match=f"{only}.* keeps its weights in int8 alone: .*made from$"):
         UnifiedPolicy(tiny / "int8", device="cpu")
+    with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
+        UnifiedPolicy(tiny / "int8", device="cpu", backend="cuda_graph")
     with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
         UnifiedPolicy(tiny / "int8", device="cpu", precision="f32")
 
@@ -165,6 +168,8 @@ def test_doctor_speaks_of_the_precision_that_the_folder_keeps(tiny: Path) -> Non
     document = json.loads(turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--json").stdout)
     rows = {row["name"]: row for row in document["checks"]}
     assert document["precision"] == "fp8" and document["auto"] == "fused" and not document["auto_runs"]
+    able = {one["name"]: one["reason"] for one in document["backends"]}
+    assert "fp8, which backend 'fused' alone runs" in able["pytorch"] and "NVIDIA GPU" in able["fused"]
     assert rows["memory"]["found"].endswith("this checkpoint takes 9 MB in fp8")
     assert rows["precision"]["level"] == "FAIL" and "fp8 needs an NVIDIA GPU" in rows["precision"]["found"]
     given = turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--precision", "bf16", "--json")

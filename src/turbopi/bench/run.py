@@ -29,6 +29,7 @@ from turbopi.bench.work import MODEL_SIZE, Job, Join, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import Solver, TimeGrid
 from turbopi.engine.graph import collect_and_empty_cache
+from turbopi.policy.kept_precision import check_backend
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.plan import TIERS, WEIGHTS_ALONE
 from turbopi.robots import Robot
@@ -81,7 +82,7 @@ class BenchPlan:
             pick(self.batches, usual.batch),
         )
 
-    def check(self, device: torch.device) -> None:
+    def check(self, device: torch.device, checkpoint: Checkpoint | None = None) -> None:
         """Raise ConfigError or BackendUnavailable for a backend or precision that can't run, before anything is run."""
         if not self.backends or not self.precisions:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
@@ -95,7 +96,10 @@ class BenchPlan:
                 raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
         for precision, name in itertools.product(self.precisions, named):
             if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.all_precisions(name):
-                backends.check(name, device, precision)
+                if checkpoint is None:
+                    backends.check(name, device, precision)
+                else:
+                    check_backend(name, device, precision, checkpoint)
 
     def jobs(self) -> Iterator[Job]:
         for horizon, cameras, size, tokens in itertools.product(
@@ -144,7 +148,7 @@ def run(
     gets what there is after each job, marked as "unfinished".
     """
     progress = progress or BenchProgress()
-    plan.check(device)
+    plan.check(device, checkpoint)
     progress.doing("measuring this machine's floors")
     floors: dict[str, Floors] = {precision: measure_floors(device, precision) for precision in plan.precisions}
     collect_and_empty_cache()

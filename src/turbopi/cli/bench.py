@@ -305,7 +305,7 @@ def bench(
             solver=None if solver is None else own.solver,
             time_grid=None if time_grid is None else own.time_grid,
         )
-        plan.check(resolved)
+        plan.check(resolved, opened)
         if ready and (plan.solver, plan.time_grid) != (None, None):
             raise ConfigError("--ready starts programs with openpi's steps: give it without --solver and --time-grid")
         if report is not None:

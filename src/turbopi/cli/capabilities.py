@@ -26,6 +26,7 @@ class Capabilities:
 def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capabilities:
     """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
     from turbopi import backends
+    from turbopi.checkpoint.quantized_folder import precision_kept
     from turbopi.policy.call_options import Denoising
     from turbopi.policy.chunk_conditioning import ChunkConditioning
     from turbopi.policy.kept_precision import check_backend
@@ -34,7 +35,8 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     model, name, writes = checkpoint.config.model, fitting.backend, checkpoint.config.writes_subtasks
     if name == "auto":
-        backends.qualified(device, precision, model, bar=sys.stderr.isatty(), writes=writes)  # type: ignore[arg-type]
+        bar, kept = sys.stderr.isatty(), precision_kept(checkpoint) is not None
+        backends.qualified(device, precision, model, bar=bar, writes=writes, kept=kept)  # type: ignore[arg-type]
         name = backends.choose(device, precision, model, writes=writes)[0]  # type: ignore[arg-type]
     check_backend(name, device, precision, checkpoint)  # type: ignore[arg-type]
     cls = backends.class_for(name, model, writes=writes)

@@ -122,14 +122,14 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         known = None if known_cameras is None else KnownCameras.load(known_cameras)
-        precision = precision or precision_kept(checkpoint_dir) or "bf16"
-        self._device = backends.resolve_device(device)
-        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
-        check_backend(name, self._device, precision, checkpoint_dir)  # before a calibration and weights are read
-
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
+        kept = precision_kept(checkpoint)
+        precision = precision or kept or "bf16"
+        self._device = backends.resolve_device(device)
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
+        check_backend(name, self._device, precision, checkpoint)  # before a calibration and weights are read
         self.config, model = checkpoint.config, checkpoint.config.model
         flow = num_denoising_steps, solver, time_grid, guidance, guidance_tag
         self._denoising = Denoising.of(self.config, *flow)
@@ -159,7 +159,7 @@ class UnifiedPolicy:
         self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
         text, writes = self.config.text, self.config.writes_subtasks
         if backend == "auto":  # when all that was given is known to be good
-            backends.qualified(self._device, precision, model, bar=progress, writes=writes)
+            backends.qualified(self._device, precision, model, bar=progress, writes=writes, kept=kept is not None)
             name, why = backends.choose(self._device, precision, model, writes=writes)
         self._guard = Guard(self._device)
         with self._guard:
