@@ -14,7 +14,7 @@ def floors_line(precision: str, floor: Floors) -> str:
     """The machine's floors in one line."""
     parts = [
         f"copy {_rate(floor.copy_bytes_per_second)}B/s",
-        f"matrix product {_rate(floor.matmul_flops_per_second)}FLOP/s",
+        f"matmul {_rate(floor.matmul_flops_per_second)}FLOP/s",
     ]
     for took, what in ((floor.launch_us, "a launch in a graph"), (floor.barrier_us, "a barrier of the whole grid")):
         if took is not None:

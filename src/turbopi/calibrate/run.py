@@ -176,12 +176,12 @@ def calibrate_model(
     method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
     scales = _scales(everywhere, histograms, method, format)
 
-    progress.begin("products of every site", 1)
+    progress.begin("matmuls of every site", 1)
     products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps, weights)
     progress.advance()
     kept = {str(site): f"not possible: {why}" for site, why in impossible.items()}
     kept |= {
-        name: f"its products alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
+        name: f"its matmuls alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
     }
     groups = _groups(eligible, scales, kept, selection, progress)
     kept |= _keep_groups(eligible, scales, kept, groups, selection, settings.target, progress)
