@@ -117,8 +117,15 @@ def test_inspect_refuses_a_wrong_configuration_after_the_rest(tmp_path: Path) ->
     """One that --config names, or the file beside the weights."""
     given = turbopi("inspect", GOLDEN / "pi05" / "torch", "--config", "pi05-libero")
     folder = torch_copy(tmp_path / "c", preset="pi05_libero", action_horizon=0)
-    beside = turbopi("inspect", folder)
-    for result, why in ((given, "did you mean pi05_libero?"), (beside, "action_horizon is 0")):
+    found = [(given, "did you mean pi05_libero?"), (turbopi("inspect", folder), "action_horizon is 0")]
+    for change, why in (
+        ({"target_time": 1}, "target_time is 1.0, but"),
+        ({"preset": "pi0_libero"}, "is for pi0, but"),
+        ({"lora_alpha": 16}, "lora_alpha and lora_rslora only apply to"),
+        ({"discrete_state_input": True, "preset": "pi05_libero", "base_model": "x"}, "base_model only applies to"),
+    ):  # what can be read, and doesn't fit
+        found.append((turbopi("inspect", torch_copy(tmp_path / next(iter(change)), **change)), why))
+    for result, why in found:
         assert result.exit_code == 2, result.output
         assert "443,232" in result.stdout and "not known yet" not in result.stdout
         assert result.stderr.startswith("error: ") and why in result.stderr
