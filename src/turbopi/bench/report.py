@@ -118,18 +118,19 @@ def _all(document: BenchDocument) -> list[str]:
                 for n in steps
             ]
 
-        head = ["steps", *map(str, steps)]
+        head = [document.main_job.unit, *map(str, steps)]
         lines += [f"## {name}: whole call, median (p95)", ""]
         lines += _table(head, ([shape, *cells(by_steps)] for shape, by_steps in rows.items()))
     return lines
 
 
 def _linear(document: BenchDocument) -> list[str]:
+    main = document.main_job
     rows = [
         [
             label(line),
-            f"{line.cameras} cameras, {line.prompt_tokens} tokens, H={line.horizon}",
-            f"{line.a_ms:.2f} + {line.b_ms:.3f} · steps",
+            f"{line.cameras} cameras, {line.prompt_tokens} tokens" + (main.of_horizon and f", H={line.horizon}"),
+            f"{line.a_ms:.2f} + {line.b_ms:.3f} · {main.unit}",
             f"{line.worst_ms:.2f}",
         ]
         for line in document.linear or ()
