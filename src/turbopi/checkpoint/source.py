@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -19,12 +20,27 @@ from turbopi.support.reading import listing
 PIECE_BYTES = 8 * 2**20
 
 Shape = tuple[int, ...]
+_RANDOM = "random weights, "
+_TOLD: "WeakKeyDictionary[WeightSource, set[str]]" = WeakKeyDictionary()  # notes that were told
 RANDOM_KEY = "turbopi_random_weights"  # in the header of files that hold random weights: they stay marked
 
 
 def random_note(random: str) -> str:
     """What every reader should know of random weights."""
-    return f"random weights, {random}: actions mean nothing"
+    return f"{_RANDOM}{random}: actions mean nothing"
+
+
+def mark_random_told(source: "WeightSource") -> None:
+    """The user was told that these weights are random."""
+    _TOLD.setdefault(source, set()).update(note for note in source.notes if note.startswith(_RANDOM))
+
+
+def untold_notes(source: "WeightSource") -> list[str]:
+    """The notes that nobody was told of, which now are told: once, however many policies are made of the weights."""
+    told = _TOLD.setdefault(source, set())
+    found = [note for note in source.notes if note not in told]
+    told.update(found)
+    return found
 
 
 @dataclass(frozen=True)

@@ -274,7 +274,8 @@ def _statistics_table(feature: str, stats: dict[str, Any], labels: list[dict[str
     shown = [name for name in ("q01", "q99", "mean", "std") if name in values]
     if "q01" not in values:
         shown = [name for name in ("min", "max", "mean", "std") if name in values]
-    labels = labels or [{"name": f"value {index}", "unit": ""} for index in range(stats["dim"])]
+    what = "action" if feature == "actions" else "value"
+    labels = labels or [{"name": f"{what} {index}", "unit": ""} for index in range(stats["dim"])]
     table = Table(title=f"{feature} in the training data", title_justify="left")
     table.add_column(feature, overflow="fold")
     if any(label["unit"] for label in labels):

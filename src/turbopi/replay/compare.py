@@ -180,7 +180,7 @@ def state_documents(run: Replayed, names: Sequence[str] | None) -> list[State]:
     ranges = [(float(low), float(high)) for low, high in zip(*run.state_range, strict=True)]
     width = run.states.shape[1]
     for index in range(width):
-        name = names[index] if names is not None and len(names) == width else f"state {index}"
+        name = names[index] if names is not None and len(names) == width else f"value {index}"
         recorded = quantiles(run.states[:, index])
         trained = ranges[index] if index < len(ranges) else None
         outside = False
