@@ -287,6 +287,8 @@ def check_verdict(verdict: Verdict, file: Path, *, kept: bool = False) -> None:
 def refusal(name: str, device: torch.device, precision: Precision, model: Network) -> str | None:
     """Why a backend can't run a model on a device in a precision, whatever was qualified; None if it can."""
     cls = class_for(name, model)
+    if not _is_for(precision, model):
+        return _not_for(precision, model)
     return _unavailable(cls, device) or cls.unavailable_in(device, precision) or _refuses(cls, model, precision)
 
 
@@ -309,10 +311,8 @@ def check(
     """
     checked_precision(precision)
     cls, given, model = class_of(name), model, model or ModelConfig()
-    if given is not None and precision in EIGHT_BITS and not _is_for(precision, model):
-        raise ConfigError(
-            f"precision {precision!r} isn't for {family_of(model).label}{_instead(device, precision, model, kept)}"
-        )
+    if given is not None and not _is_for(precision, model):
+        raise ConfigError(f"{_not_for(precision, model)}{_instead(device, precision, model, kept)}")
     if precision not in (own := all_precisions(name)):
         where = " (models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU)"
         where *= precision == WEIGHTS_ALONE
@@ -332,9 +332,15 @@ def check(
 
 
 def _is_for(precision: Precision, model: Network) -> bool:
-    """Whether a backend runs models of this family in one of `EIGHT_BITS`, on some device."""
+    """Whether a backend runs models of this family in this precision, on some device."""
     family = family_of(model)
-    return family.planned if precision in TIERS else family.reader is not None
+    if precision == WEIGHTS_ALONE:
+        return family.reader is not None
+    return family.planned or precision not in TIERS
+
+
+def _not_for(precision: Precision, model: Network) -> str:
+    return f"precision {precision!r} isn't for {family_of(model).label}"
 
 
 def _instead(device: torch.device, precision: Precision, model: Network, kept: bool) -> str:

@@ -91,21 +91,14 @@ def list_backends(device: str, precision: str, checkpoint: "Checkpoint | None" =
 def _why_not(name: str, device: "torch.device", tier: "Precision", checkpoint: "Checkpoint | None") -> str | None:
     from turbopi import backends
     from turbopi.checkpoint.quantized_folder import precision_kept
-    from turbopi.quantization.plan import TIERS
 
     kept = None if checkpoint is None else precision_kept(checkpoint)
     if kept is not None and name != "fused" and name in backends.BACKENDS:
         return f"the folder keeps its weights in {kept}, which backend 'fused' alone runs"
     if (reason := backends.availability(name, device)) is not None or checkpoint is None:
         return reason
-    config = checkpoint.config
     own = backends.precisions(name)
-    if set(own) <= set(TIERS):
-        try:
-            _ = config.planned_model
-        except ConfigError:
-            return f"calibrations are for Pi0 and Pi0.5 alone, and this is a {config.model.kind}"
-    return backends.refusal(name, device, tier if tier in own else own[0], config.model)
+    return backends.refusal(name, device, tier if tier in own else own[0], checkpoint.config.model)
 
 
 def show_backends(found: dict[str, Any], output: Output) -> None:
