@@ -13,7 +13,7 @@ from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.checkpoint.source import mark_random_told, untold_notes
+from turbopi.checkpoint.source import mark_random_reported, unreported_notes
 from turbopi.cli import checkpoints
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 
@@ -79,12 +79,12 @@ def test_random_weights_that_were_converted_say_so_in_every_command(tiny: Path, 
     again = tmp_path / "again"
     result = turbopi("convert", tiny, again, "--precision", "f32", "--json")
     assert "RANDOM WEIGHTS (seed 4): the actions mean nothing." in result.stderr
-    for told in (False, True):  # by a command, which says so in its own words
+    for reported in (False, True):  # by a command, which says so in its own words
         source = open_checkpoint(tiny).source
-        if told:
-            mark_random_told(source)
-        assert ("random weights, seed 4: actions mean nothing" in untold_notes(source)) == (not told)
-        assert untold_notes(source) == [], "whatever is made of the weights next"
+        if reported:
+            mark_random_reported(source)
+        assert ("random weights, seed 4: actions mean nothing" in unreported_notes(source)) == (not reported)
+        assert unreported_notes(source) == [], "whatever is made of the weights next"
     document = json.loads(result.stdout)
     opened = open_checkpoint(again)
     assert document["random_weights"] is True and document["checkpoint_path"] == str(tiny)

@@ -21,7 +21,7 @@ PIECE_BYTES = 8 * 2**20
 
 Shape = tuple[int, ...]
 _RANDOM = "random weights, "
-_TOLD: "WeakKeyDictionary[WeightSource, set[str]]" = WeakKeyDictionary()  # notes that were told
+_REPORTED: "WeakKeyDictionary[WeightSource, set[str]]" = WeakKeyDictionary()  # notes that were reported
 RANDOM_KEY = "turbopi_random_weights"  # in the header of files that hold random weights: they stay marked
 
 
@@ -30,16 +30,16 @@ def random_note(random: str) -> str:
     return f"{_RANDOM}{random}: actions mean nothing"
 
 
-def mark_random_told(source: "WeightSource") -> None:
-    """The user was told that these weights are random."""
-    _TOLD.setdefault(source, set()).update(note for note in source.notes if note.startswith(_RANDOM))
+def mark_random_reported(source: "WeightSource") -> None:
+    """Somebody has said in other words that these weights are random."""
+    _REPORTED.setdefault(source, set()).update(note for note in source.notes if note.startswith(_RANDOM))
 
 
-def untold_notes(source: "WeightSource") -> list[str]:
-    """The notes that nobody was told of, which now are told: once, however many policies are made of the weights."""
-    told = _TOLD.setdefault(source, set())
-    found = [note for note in source.notes if note not in told]
-    told.update(found)
+def unreported_notes(source: "WeightSource") -> list[str]:
+    """The notes that weren't reported yet, which now count as reported: however many policies are made, once."""
+    reported = _REPORTED.setdefault(source, set())
+    found = [note for note in source.notes if note not in reported]
+    reported.update(found)
     return found
 
 

@@ -19,7 +19,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.checkpoint.quantized_folder import precision_kept
-from turbopi.checkpoint.source import untold_notes
+from turbopi.checkpoint.source import unreported_notes
 from turbopi.config import PolicyConfig, Solver, TimeGrid, memory_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
@@ -146,7 +146,7 @@ class UnifiedPolicy:
             known_cameras=known,
         )
         self._watch = PolicyWatch()
-        of_weights = [] if checkpoint.format == "random" else untold_notes(checkpoint.source)
+        of_weights = [] if checkpoint.format == "random" else unreported_notes(checkpoint.source)
         for note in (*of_weights, *self._pipeline.notes):
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
