@@ -21,6 +21,8 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.checkpoint import Checkpoint, open_checkpoint, write_random
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.checkpoint.quantized_folder import MANIFEST, TENSORS, QuantizedOnly, sealed
+from turbopi.cli.capabilities import check_server
+from turbopi.cli.options import PolicyOptions
 from turbopi.config import PolicyConfig
 from turbopi.engine.call import Cache, Images, StaticCall
 from turbopi.engine.quantized_writer import write_quantized
@@ -32,6 +34,7 @@ from turbopi.quantization.directions import directions
 from turbopi.quantization.formats import Numbers
 from turbopi.quantization.plan import TIERS, Tier
 from turbopi.quantization.sites import sites
+from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import BackendUnavailable, CalibrationError, CheckpointError, ConfigError
 
 CPU = torch.device("cpu")
@@ -162,6 +165,12 @@ def test_every_command_says_that_the_folder_has_one_precision(tiny: Path, comman
     refused = turbopi(*command.split(), tiny / "int8", "--device", "cpu")
     assert refused.exit_code == 2 and "keeps its weights in int8" in refused.stderr
     assert "take the checkpoint that it was made from" in refused.stderr
+
+
+def test_a_fleet_elsewhere_may_run_what_this_machine_cannot(tiny: Path) -> None:
+    options = PolicyOptions(backend="pytorch", precision="bf16", device="cpu")
+    server = ServerOptions(execution="rtc", control_hz=50.0)
+    check_server(server, options, open_checkpoint(tiny / "fp8"), here=False)
 
 
 def test_doctor_speaks_of_the_precision_that_the_folder_keeps(tiny: Path) -> None:
