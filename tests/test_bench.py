@@ -359,7 +359,8 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     assert document["robot"] == "libero"
     height, width = seen[0]["observation/image"].shape[:2]
     expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height, "join": "none"}
-    expected["batch"] = 1
+    expected |= {"batch": 1, "writes_tokens": False}
+    assert "writes_tokens" not in document["main_job"]
     job = asdict(as_document(document["main_job"], Job, "stdout"))
     assert {**job, "prompt_tokens": 0} == {**expected, "prompt_tokens": 0}
     assert document["main_job"]["prompt_tokens"] > 20
