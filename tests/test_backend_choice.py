@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -12,8 +13,9 @@ from turbopi.backends import qualification
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.qualification import Verdict
 from turbopi.config import PRESETS, MemoryConfig
+from turbopi.models.pi0.conditioning import Form
 from turbopi.models.smolvla.family import BASE
-from turbopi.support.errors import BackendUnavailable
+from turbopi.support.errors import BackendUnavailable, ConfigError
 
 GPU = torch.device("cuda", 0)
 
@@ -113,19 +115,19 @@ def test_fp8_names_what_is_truly_missing(
     [
         *((one, None) for one in ((8, 0), (8, 6), (8, 7), (8, 9), (9, 0), (12, 0), (12, 1))),
         *(
-            ((10, minor), f"multiplies INT8 by mma.sync, which nobody timed there; this GPU has 10.{minor}; use 'fp8'")
+            (
+                (10, minor),
+                f"multiplies INT8 by mma.sync, which nobody timed there; this GPU has 10.{minor}; take precision",
+            )
             for minor in (0, 3)
         ),
-        ((11, 0), "this GPU has 11.0; use 'fp8'"),
+        ((11, 0), "this GPU has 11.0; take precision 'bf16' or 'fp8'"),
     ],
 )
 def test_int8_runs_where_its_fast_instruction_is_taken(
     monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], reason: str | None
 ) -> None:
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "NVIDIA H200")
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    on_a_gpu_of(monkeypatch, capability)
     name, why = backends.choose(GPU, "int8")
     assert name == "fused" and ("fp8 and bf16 are quicker here" in why) == (capability == (9, 0))
     if reason is None:
@@ -140,18 +142,74 @@ def test_int8_on_a_cpu_names_the_emulation() -> None:
         backends.check("fused", torch.device("cpu"), "int8")
 
 
+SMOLVLA, FAST = BASE.model, PRESETS["pi0_fast_base"].model
+REMEMBERING = replace(PRESETS["pi05_base"].model, memory=MemoryConfig(visual=True, proprioceptive=False))
+
+
+@pytest.mark.parametrize("device", ["cpu", "gpu"])
+@pytest.mark.parametrize("model", [PRESETS["pi05_base"].model, REMEMBERING, SMOLVLA, FAST], ids=lambda one: one.kind)
+@pytest.mark.parametrize("precision", backends.PRECISIONS)
+@pytest.mark.parametrize("name", backends.BACKENDS)
+def test_what_an_error_advises_the_model_can_do_on_the_device(
+    monkeypatch: pytest.MonkeyPatch, name: str, precision: Any, model: Any, device: str
+) -> None:
+    on_a_gpu_of(monkeypatch, (8, 6))  # which has INT8 and no FP8
+    where = GPU if device == "gpu" else torch.device("cpu")
+
+    def refused(name: str, precision: Any) -> str | None:
+        try:
+            backends.check(name, where, precision, model)
+        except (BackendUnavailable, ConfigError) as error:
+            return str(error)
+        return None
+
+    advice = re.findall(r"\b(?:take|use|judge) [^;]*", refused(name, precision) or "")
+    own = backends.all_precisions(name)
+    taken = [one for text in advice for one in re.findall(r"'(\w[\w-]*)'", text) if text != "use device 'cpu'"]
+    for one in taken:
+        if one in backends.PRECISIONS:
+            assert refused(backends.choose(where, one, model)[0], one) is None, advice
+        else:
+            tier = precision if precision in own or one.startswith("emulated") else own[0]
+            chosen = backends.choose(where, tier, model)[0] if one == "auto" else one
+            assert refused(chosen, tier) is None, advice
+
+
+@pytest.mark.parametrize("model", [PRESETS["pi05_base"].model, SMOLVLA], ids=lambda one: one.kind)
+@pytest.mark.parametrize("name", backends.BACKENDS)
+def test_a_backend_without_a_form_names_those_that_have_it(name: str, model: Any) -> None:
+    cls = backends.class_for(name, model)
+    for form in get_args(Form) if cls.refuses_model(model) is None else ():
+        for advice in re.findall(r"or take (backend .*)", cls.refuses_form(form) or ""):
+            for other in set(re.findall(r"'(\w+)'", advice)) & backends.BACKENDS.keys():
+                assert backends.class_for(other, model).refuses_form(form) is None, (form, advice)
+
+
+def test_a_family_without_a_precision_is_told_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    on_a_gpu_of(monkeypatch, (9, 0))
+    fast = "precision 'fp8' isn't for Pi0-FAST; take precision 'bf16'"
+    with pytest.raises(ConfigError, match=f"{fast}$"):
+        backends.check("fused", torch.device("cpu"), "fp8", FAST)
+    with pytest.raises(ConfigError, match=f"{fast} or 'int8-weights'$"):
+        backends.check("fused", GPU, "fp8", FAST)
+    with pytest.raises(BackendUnavailable, match=r"int8-weights needs an NVIDIA GPU .*; take precision 'bf16'$"):
+        backends.check("cuda_graph", torch.device("cpu"), "int8-weights", FAST)
+
+
+def on_a_gpu_of(monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int]) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "NVIDIA H200")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+
+
 def test_auto_takes_for_a_model_what_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch, {})
-    smolvla, fast, remembering = (
-        BASE.model,
-        PRESETS["pi0_fast_base"].model,
-        replace(PRESETS["pi05_base"].model, memory=MemoryConfig(visual=True, proprioceptive=False)),
-    )
-    assert backends.choose(GPU, model=smolvla)[0] == "fused"
-    assert backends.choose(GPU, "f32", model=smolvla)[0] == "cuda_graph"
-    narrow = replace(smolvla, text=replace(smolvla.text, width=120, head_dim=8))  # type: ignore[attr-defined]
+    assert backends.choose(GPU, model=SMOLVLA)[0] == "fused"
+    assert backends.choose(GPU, "f32", model=SMOLVLA)[0] == "cuda_graph"
+    narrow = replace(SMOLVLA, text=replace(SMOLVLA.text, width=120, head_dim=8))  # type: ignore[attr-defined]
     name, said = backends.choose(GPU, model=narrow)
     assert name == "cuda_graph" and "heads are narrower than a tensor core's 16 columns" in said
-    for model in (fast, remembering):
+    for model in (FAST, REMEMBERING):
         name, said = backends.choose(GPU, model=model)
         assert name == "cuda_graph" and "not fused" in said

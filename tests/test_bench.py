@@ -290,9 +290,9 @@ def floors_of(monkeypatch: pytest.MonkeyPatch, bytes_per_second: float, flops_pe
 @pytest.mark.parametrize(
     ("bytes_per_second", "flops_per_second", "line"),
     [
-        (4.25e12, 1.404e15, "copy 4.25 TB/s, matrix product 1404 TFLOP/s"),
-        (1.5e10, 8.4e10, "copy 15.0 GB/s, matrix product 84.0 GFLOP/s"),
-        (4e9, 3e8, "copy 4.00 GB/s, matrix product 0.300 GFLOP/s"),
+        (4.25e12, 1.404e15, "copy 4.25 TB/s, matmul 1404 TFLOP/s"),
+        (1.5e10, 8.4e10, "copy 15.0 GB/s, matmul 84.0 GFLOP/s"),
+        (4e9, 3e8, "copy 4.00 GB/s, matmul 0.300 GFLOP/s"),
     ],
 )
 def test_floors_are_shown_with_three_digits(bytes_per_second: float, flops_per_second: float, line: str) -> None:
@@ -330,7 +330,7 @@ def test_points_above_the_roofline_are_warned_about(
     assert f"prefix {one['milliseconds']['prefix']['p50']:,.2f} ms (floor {one['floor_ms']['prefix']:,.2f})" in warning
     assert "run again when it is idle" in warning
     assert f"WARNING: {warning}" in result.stdout
-    assert "copy 0.0100 GB/s, matrix product 0.100 GFLOP/s" in result.stdout, "no number is cut to 0.000"
+    assert "copy 0.0100 GB/s, matmul 0.100 GFLOP/s" in result.stdout, "no number is cut to 0.000"
     assert f"**Warning:** {warning}" in (tmp_path / "report.md").read_text()
     roofline = drawn[1].axes[0]
     circled = [line.get_xydata()[0].tolist() for line in roofline.get_lines() if line.get_markersize() == 16]
@@ -359,7 +359,8 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     assert document["robot"] == "libero"
     height, width = seen[0]["observation/image"].shape[:2]
     expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height, "join": "none"}
-    expected["batch"] = 1
+    expected |= {"batch": 1, "writes_tokens": False}
+    assert "writes_tokens" not in document["main_job"]
     job = asdict(as_document(document["main_job"], Job, "stdout"))
     assert {**job, "prompt_tokens": 0} == {**expected, "prompt_tokens": 0}
     assert document["main_job"]["prompt_tokens"] > 20

@@ -133,7 +133,7 @@ def test_a_base_that_the_adapter_names_is_found_as_lerobot_finds_it(
 
 def test_a_start_that_left_the_base_alone_is_merged_like_any(folder: Path) -> None:
     expected = weights(folder)["action_in_proj.weight"]
-    for start in (False, "gaussian", "eva", "orthogonal"):
+    for start in (False, None, "gaussian", "Gaussian", "GAUSSIAN", "eva", "orthogonal"):
         edit_json(folder / CONFIG, lambda content: content.update(init_lora_weights=start))  # noqa: B023
         assert torch.equal(weights(folder)["action_in_proj.weight"], expected), start
 
@@ -187,6 +187,8 @@ def test_whole_weights_are_read_where_lerobot_reads_them(folder: Path) -> None:
         ({"layer_replication": [[0, 2]]}, r"layer_replication = \[\[0, 2\]\]"),
         ({"init_lora_weights": "pissa"}, "init_lora_weights = 'pissa'"),
         ({"init_lora_weights": ["a"]}, r"init_lora_weights = \['a'\]"),
+        ({"init_lora_weights": "EVA"}, "init_lora_weights = 'EVA'"),  # which peft doesn't know, either
+        ({"init_lora_weights": 1}, "init_lora_weights = 1"),
         ({"something_new": 3}, "something_new = 3"),
         ({"r": 0}, "r is 0; expected a whole number from 1"),
         ({"r": 4.0}, r"r is 4\.0; expected a whole number"),

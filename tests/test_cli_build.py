@@ -137,7 +137,7 @@ def test_scales_from_noise_are_refused() -> None:
         (
             TensorRTFp8Backend,
             (8, 7),
-            "E4M3 products need compute capability 8.9 or newer, this GPU has 8.7; use 'tensorrt'",
+            "E4M3 matmuls need compute capability 8.9 or newer, this GPU has 8.7; use 'tensorrt'",
         ),
         (TensorRTFp8Backend, (8, 9), None),
         (TensorRTBackend, (8, 7), None),

@@ -13,6 +13,7 @@ from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
+from turbopi.checkpoint.source import mark_random_reported, unreported_notes
 from turbopi.cli import checkpoints
 from turbopi.policy.shipped import FRAMES, SMALL_POLICY, load_frames
 
@@ -78,6 +79,12 @@ def test_random_weights_that_were_converted_say_so_in_every_command(tiny: Path, 
     again = tmp_path / "again"
     result = turbopi("convert", tiny, again, "--precision", "f32", "--json")
     assert "RANDOM WEIGHTS (seed 4): the actions mean nothing." in result.stderr
+    for reported in (False, True):  # by a command, which says so in its own words
+        source = open_checkpoint(tiny).source
+        if reported:
+            mark_random_reported(source)
+        assert ("random weights, seed 4: actions mean nothing" in unreported_notes(source)) == (not reported)
+        assert unreported_notes(source) == [], "whatever is made of the weights next"
     document = json.loads(result.stdout)
     opened = open_checkpoint(again)
     assert document["random_weights"] is True and document["checkpoint_path"] == str(tiny)
@@ -117,8 +124,15 @@ def test_inspect_refuses_a_wrong_configuration_after_the_rest(tmp_path: Path) ->
     """One that --config names, or the file beside the weights."""
     given = turbopi("inspect", GOLDEN / "pi05" / "torch", "--config", "pi05-libero")
     folder = torch_copy(tmp_path / "c", preset="pi05_libero", action_horizon=0)
-    beside = turbopi("inspect", folder)
-    for result, why in ((given, "did you mean pi05_libero?"), (beside, "action_horizon is 0")):
+    found = [(given, "did you mean pi05_libero?"), (turbopi("inspect", folder), "action_horizon is 0")]
+    for change, why in (
+        ({"target_time": 1}, "target_time is 1.0, but"),
+        ({"preset": "pi0_libero"}, "is for pi0, but"),
+        ({"lora_alpha": 16}, "lora_alpha and lora_rslora only apply to"),
+        ({"discrete_state_input": True, "preset": "pi05_libero", "base_model": "x"}, "base_model only applies to"),
+    ):  # what can be read, and doesn't fit
+        found.append((turbopi("inspect", torch_copy(tmp_path / next(iter(change)), **change)), why))
+    for result, why in found:
         assert result.exit_code == 2, result.output
         assert "443,232" in result.stdout and "not known yet" not in result.stdout
         assert result.stderr.startswith("error: ") and why in result.stderr

@@ -115,7 +115,7 @@ def test_of_a_model_that_writes_tokens_the_action_tokenizer_and_its_backends_are
     assert result.exit_code == 0
     reasons = {one["name"]: one["reason"] for one in document["backends"]}
     assert reasons["pytorch"] is None and "has no plan for Pi0-FAST" in reasons["pytorch_compile"]
-    assert "Pi0 and Pi0.5 alone" in reasons["emulated_fp8"]
+    assert "precision 'fp8' isn't for Pi0-FAST" in reasons["emulated_fp8"]
 
 
 def test_a_checkpoint_is_given_as_to_other_commands_or_as_an_option(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from turbopi.backends.qualification import Verdict
 from turbopi.bench.measured import measured_calls
 from turbopi.cli import doctor, gpu_checkups
 from turbopi.cli.checkup import Row
+from turbopi.cli.typed import as_typed
 from turbopi.support.errors import BackendUnavailable
 
 CAPABILITIES = [(8, 0), (8, 6), (8, 7), (8, 9), (9, 0), (10, 0), (11, 0), (12, 0)]
@@ -114,7 +115,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
         else:
             refused = None
         if refused is not None:
-            assert row == Row("OK", row.name, f"doesn't run: {refused}")
+            assert row == Row("OK", row.name, f"doesn't run: {as_typed(refused)}")
         else:
             assert row.level == "OK" and row.found.startswith(f"{chosen}: ")
             assert ("isn't qualified on this GPU" in row.found) == (capability != (9, 0))

@@ -187,7 +187,7 @@ def test_what_a_policy_offers_is_known_before_its_weights_are_loaded(
 
 
 def test_what_backends_for_gpus_offer_is_known_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "check", lambda *_: None)
+    monkeypatch.setattr(backends, "check", lambda *_, **__: None)
     found = {
         name: capabilities_of(options, options.open(None))
         for name in ("fused", "cuda_graph", "tensorrt", "tensorrt_pipelined")

@@ -208,7 +208,7 @@ def test_a_request_that_came_too_late_costs_no_connection() -> None:
 def test_a_running_chunk_of_another_kind_is_refused() -> None:
     with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
         left_over: Any = np.zeros((3, 32), np.float32)
-        with pytest.raises(ObservationError, match=r"previous is a ndarray; .* turbopi\.realtime\.RunningChunk"):
+        with pytest.raises(ObservationError, match=r"previous is an ndarray; .* turbopi\.realtime\.RunningChunk"):
             client.infer({"place": 1}, previous=left_over)
 
 

@@ -164,7 +164,7 @@ def ask(source: RemotePolicy) -> Answer:
         ("hello", "sent text where a message should be: hello"),
         (b"\xc1", "doesn't speak openpi's protocol: "),
         ([1, 2], "sent a list where a map should be"),
-        (None, "sent a NoneType where a map should be"),
+        (None, "sent None where a map should be"),
         (
             {"config": float("inf")},
             "tells metadata.config = inf; expected text, finite numbers, lists and maps of them",

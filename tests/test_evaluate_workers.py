@@ -110,7 +110,7 @@ IMAGE = np.zeros((4, 4, 3), np.uint8)
 @pytest.mark.parametrize(
     ("observation", "why"),
     [
-        (None, "a NoneType; it should be a dict"),
+        (None, "is None; it should be a dict"),
         ({}, "no 'image'; it has nothing"),
         ({"image": None}, "'image' is NoneType; an image should be uint8"),
         ({"image": IMAGE / 255}, "'image' is float64"),

@@ -218,7 +218,7 @@ def test_a_chunk_that_comes_after_its_last_action_is_dropped() -> None:
         ({"actions": np.full((4, 1), np.inf)}, "not_finite", "NaN"),
         ({"actions": np.full((4, 1), -1.7e308)}, "not_finite", "beyond float32"),
         ({"state": 1}, "malformed", 'no "actions"; its keys: state'),
-        (None, "malformed", "is a NoneType"),
+        (None, "malformed", "is None"),
         ({"actions": None}, "malformed", "NoneType"),
         ({"actions": "none"}, "malformed", "str"),
         ({"actions": np.zeros((0, 1))}, "malformed", "[0, 1]"),

@@ -383,7 +383,7 @@ def test_verify_and_bench_take_it_and_what_keeps_no_history_refuses_it_by_name(v
 
 def test_what_has_no_plan_for_memory_says_so(tmp_path: Path) -> None:
     checkpoint = make_checkpoint("visual", tmp_path / "one")
-    with pytest.raises(BackendUnavailable, match=r"has no plan for Pi0.5 with memory; take backend 'pytorch'"):
+    with pytest.raises(BackendUnavailable, match=r"has no plan for Pi0.5 with memory; take backend 'auto'"):
         UnifiedPolicy(checkpoint, backend="pytorch_compile", device="cpu")
     with pytest.raises(BackendUnavailable, match=r"has no plan for Pi0.5 with memory"):
         UnifiedPolicy(checkpoint, backend="onnx", precision="f32", device="cpu")

@@ -17,6 +17,7 @@ from typer.testing import CliRunner, Result
 
 from turbopi import UnifiedPolicy
 from turbopi.backends import tokens
+from turbopi.bench.work import Job
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.cli import app
 from turbopi.config import PRESETS
@@ -190,9 +191,10 @@ def test_lm_head_writes_and_embed_tokens_reads_where_lerobot_trained_them_apart(
     state = open_checkpoint(adapted).load("cpu", "f32").state
     change = state["lm_head.weight"] - state["vlm.embed_tokens.weight"]
     assert change[5, 0] == 2 and change.count_nonzero() == 1
-    save_file({name: one for name, one in tensors.items() if name != EMBEDDING}, base / "model.safetensors")
-    with pytest.raises(CheckpointError, match=r"lm_head\.weight, which the base model doesn't have"):
-        open_checkpoint(adapted)
+    for missing in (EMBEDDING, HEAD):
+        save_file({name: one for name, one in tensors.items() if name != missing}, base / "model.safetensors")
+        with pytest.raises(CheckpointError, match=r"has one table for both\. Merge it in LeRobot's environment"):
+            open_checkpoint(adapted)
 
 
 def test_a_prompt_that_names_a_control_piece_has_it_as_in_lerobot(folders: Path) -> None:
@@ -351,13 +353,30 @@ def test_commands_take_it(folders: Path, tmp_path: Path) -> None:
     assert described["kind"] == "pi0_fast" and described["parameters"]["expert"] == 0
 
 
+def test_a_timed_job_has_tokens_and_no_horizon_or_steps() -> None:
+    assert str(Job(writes_tokens=True)) == "2 cameras, 48 tokens, 10 tokens written"
+    assert str(Job()) == "2 cameras, 48 tokens, H=10, 10 steps"
+    refused = CliRunner().invoke(app, ["bench", "--random-weights", "pi0_fast_tiny", "--horizons", "10"])
+    assert refused.exit_code == 2 and "writes tokens, --steps of them, and has no horizon" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_benchs_title_and_report_have_tokens_written(tmp_path: Path) -> None:
+    quick = ("bench", "--random-weights", "pi0_fast_tiny", "--calls", "1", "--seconds", "0", "--cameras", "1")
+    shown = " ".join(run_command(*quick, "--steps", "1,2", "--no-error", "--report", tmp_path).stdout.split())
+    for text in (shown, (tmp_path / "report.md").read_text()):
+        assert "2 tokens written" in text and " H=10" not in text and " steps" not in text
+
+
 @pytest.mark.slow
 def test_random_weights_are_timed_and_verified(tmp_path: Path) -> None:
     measured = run_command(
         *("bench", "--random-weights", "pi0_fast_tiny", "--calls", "1", "--steps", "2,3", "--seconds", "0"),
         *("--precisions", "f32", "--cameras", "1", "--json"),
     )
-    results = _document(measured)["results"]
+    document = _document(measured)
+    assert document["main_job"]["writes_tokens"] is True
+    results = document["results"]
     assert [one["job"]["steps"] for one in results] == [2, 3] and all(one["floor_ms"]["denoise"] for one in results)
     verified = run_command(
         *("verify", "--random-weights", "pi0_fast_tiny", "--backend", "pytorch", "--precision", "f32", "--count", "1"),

@@ -313,7 +313,7 @@ def test_a_robots_own_faults_are_refused_like_an_observations() -> None:
         ({"images": {"base_0_rgb": np.zeros((3, 5, 5), np.uint8)}}, r"base_0_rgb has shape \(3, 5, 5\)"),
         ({"images": {"base_0_rgb": np.zeros((5, 5, 3), np.int64)}}, "base_0_rgb has dtype int64"),
         ({"images": {}}, "base_0_rgb is None"),
-        ({"prompt": 7}, "prompt is a int"),
+        ({"prompt": 7}, "prompt is an int"),
     ):
         edges = pipeline(PLAIN, 7, 7, robot=Faulty(**replaced))
         with pytest.raises(ObservationError, match=message):

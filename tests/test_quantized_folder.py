@@ -21,6 +21,8 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.checkpoint import Checkpoint, open_checkpoint, write_random
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.checkpoint.quantized_folder import MANIFEST, TENSORS, QuantizedOnly, sealed
+from turbopi.cli.capabilities import check_server
+from turbopi.cli.options import PolicyOptions
 from turbopi.config import PolicyConfig
 from turbopi.engine.call import Cache, Images, StaticCall
 from turbopi.engine.quantized_writer import write_quantized
@@ -32,6 +34,7 @@ from turbopi.quantization.directions import directions
 from turbopi.quantization.formats import Numbers
 from turbopi.quantization.plan import TIERS, Tier
 from turbopi.quantization.sites import sites
+from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import BackendUnavailable, CalibrationError, CheckpointError, ConfigError
 
 CPU = torch.device("cpu")
@@ -148,8 +151,11 @@ def test_what_such_a_folder_cannot_do_is_refused_by_name(tiny: Path, tmp_path: P
 
 
 def test_the_policy_takes_the_folders_precision_unless_another_is_given(tiny: Path) -> None:
-    with pytest.raises(BackendUnavailable, match=r"can't run on cpu.*emulated_int8'.*keeps its weights in int8 alone"):
+    only = "can't run on cpu: int8 needs an NVIDIA GPU of compute capability 8.x, 9.0 or 12.x. "
+    with pytest.raises(BackendUnavailable, match=f"{only}.* keeps its weights in int8 alone: .*made from$"):
         UnifiedPolicy(tiny / "int8", device="cpu")
+    with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
+        UnifiedPolicy(tiny / "int8", device="cpu", backend="cuda_graph")
     with pytest.raises(QuantizedOnly, match="keeps its weights in int8"):
         UnifiedPolicy(tiny / "int8", device="cpu", precision="f32")
 
@@ -161,10 +167,18 @@ def test_every_command_says_that_the_folder_has_one_precision(tiny: Path, comman
     assert "take the checkpoint that it was made from" in refused.stderr
 
 
+def test_a_fleet_elsewhere_may_run_what_this_machine_cannot(tiny: Path) -> None:
+    options = PolicyOptions(backend="pytorch", precision="bf16", device="cpu")
+    server = ServerOptions(execution="rtc", control_hz=50.0)
+    check_server(server, options, open_checkpoint(tiny / "fp8"), here=False)
+
+
 def test_doctor_speaks_of_the_precision_that_the_folder_keeps(tiny: Path) -> None:
     document = json.loads(turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--json").stdout)
     rows = {row["name"]: row for row in document["checks"]}
     assert document["precision"] == "fp8" and document["auto"] == "fused" and not document["auto_runs"]
+    able = {one["name"]: one["reason"] for one in document["backends"]}
+    assert "fp8, which backend 'fused' alone runs" in able["pytorch"] and "NVIDIA GPU" in able["fused"]
     assert rows["memory"]["found"].endswith("this checkpoint takes 9 MB in fp8")
     assert rows["precision"]["level"] == "FAIL" and "fp8 needs an NVIDIA GPU" in rows["precision"]["found"]
     given = turbopi("doctor", "--checkpoint", tiny / "fp8", "--device", "cpu", "--precision", "bf16", "--json")

@@ -35,7 +35,7 @@ def _refused(call: Any, error: type[TurboPiError] = CheckpointError) -> str:
         (b"{} {}", "isn't JSON"),
         (b"\xff\xfe{\0}\0", "isn't JSON: 'utf-8' codec"),
         (b"[]", "is a list; expected an object"),
-        (b"null", "is a NoneType; expected an object"),
+        (b"null", "is None; expected an object"),
         (b'{"a": NaN}', ": a is nan, which no JSON has"),
         (b'{"a": {"b c": [1, -Infinity]}}', ": a.'b c'[1] is -inf, which no JSON has"),
         (b'{"a": 1e999}', "the number 1e999 is beyond float64"),

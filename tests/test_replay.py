@@ -4,6 +4,7 @@ import functools
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from replay_data import EVERY, write_npz
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli.replay import parse_numbers
+from turbopi.config import Normalization
 from turbopi.policy.known_cameras import KnownCameras
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.policy.shipped import CHASE_POLICY, SMALL_POLICY
-from turbopi.preprocess.normalize import Normalizer
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.replay import compare
 from turbopi.replay.document import Control, ReplayDocument, Verdict
@@ -131,9 +132,9 @@ def judged(
         previous=np.full((40, 4), np.nan),
         units=np.full(4, reach),
         middle=middle,
+        ends=np.stack([middle - reach, middle + reach]),
         states=np.zeros((40, 3)),
-        state_scale=Normalizer("identity", None, "state"),
-        reach=1.0,
+        state_range=(np.empty(0), np.empty(0)),
         call_ms=[1.0],
         changed=(),
         variations={},
@@ -156,6 +157,21 @@ def test_another_checkpoint_is_no_match(tmp_path: Path) -> None:
     other = UnifiedPolicy(CHASE_POLICY, device="cpu", precision="f32", num_denoising_steps=1)
     verdict = document_of(write_npz(tmp_path / "data"), other).verdict
     assert verdict.level == "differs" and "States are outside of the checkpoint's statistics" in verdict.hints[0]
+
+
+@pytest.mark.parametrize("mode", ["zscore", "quantile"])
+def test_the_training_range_is_that_of_every_call_and_of_inspect(tmp_path: Path, mode: Any) -> None:
+    """q01 to q99 where the statistics have them, whatever normalises."""
+    opened = open_checkpoint(CHASE_POLICY)
+    config = replace(opened.config, normalization=Normalization(mode, mode))
+    one = UnifiedPolicy(
+        replace(opened, config=config), backend="pytorch", precision="f32", device="cpu", num_denoising_steps=1
+    )
+    document = document_of(write_npz(tmp_path / "data"), one)
+    features = one.metadata["features"]
+    for found, feature in ((document.states, "state"), (document.policies[0].joints, "actions")):
+        expected = [(each["low"], each["high"]) for each in features[feature]]
+        np.testing.assert_allclose(np.array([each.trained for each in found]), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_what_the_actions_show_is_named() -> None:

@@ -199,9 +199,9 @@ def test_prompts_come_in_several_forms(value: Any) -> None:
     ("value", "message"),
     [
         (None, "prompt is None; leave the key out"),
-        (3, "prompt is a int, expected text"),
+        (3, "prompt is an int, expected text"),
         (["fold", "open"], "prompt is a list"),
-        (np.array(["fold", "open"]), "prompt is a ndarray"),
+        (np.array(["fold", "open"]), "prompt is an ndarray"),
         (np.array(1.5), "prompt is a float"),
         (b"\xff\xfe", "prompt is bytes that aren't UTF-8"),
     ],
@@ -422,7 +422,7 @@ def test_the_plain_robots_masked_cameras_are_as_if_not_sent() -> None:
         ({"base_0_rgb": np.zeros(2, bool)}, r"image_mask/base_0_rgb is \[False False\]; expected"),
         ({"base_0_rgb": [[1], [2, 3]]}, r"image_mask/base_0_rgb is \[\[1\], \[2, 3\]\]; expected true or false"),
         ({"base_0_rgb": False, "right_wrist_0_rgb": False}, "image_mask leaves out all of base_0_rgb, right_wrist"),
-        (3, "'image_mask' is a int, expected a dict"),
+        (3, "'image_mask' is an int, expected a dict"),
     ):
         with pytest.raises(ObservationError, match=message):
             plain.inputs({"image": camera_images, **rest, "image_mask": wrong})

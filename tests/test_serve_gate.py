@@ -4,6 +4,7 @@ import asyncio
 import logging
 import os
 import re
+import socket
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ from turbopi.realtime.wire import pack
 from turbopi.serve import PolicyServer
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limits import Limits
 from turbopi.support.errors import ConfigError
 
 REASON = "CUDA error: an illegal memory access was encountered"
@@ -222,6 +224,36 @@ def test_what_is_no_request_for_this_server_gets_a_400(line: str) -> None:
         assert server.metrics.errors_so_far() == {"malformed": 1}
 
     served(test)
+
+
+@pytest.mark.parametrize("line", ["PUT /v1/actions HTTP/1.1", "hello"])
+def test_a_client_that_sends_on_reads_its_400_and_its_connection_ends_when_it_leaves(line: str) -> None:
+    """A socket that is closed before all of it is read is reset, and the client may lose what it was sent."""
+
+    async def test(server: PolicyServer) -> None:
+        def send_all_and_read() -> bytes:
+            with socket.create_connection(("127.0.0.1", server.port)) as client:
+                client.sendall(f"{line}\r\nHost: a\r\nContent-Length: {8 << 20}\r\n\r\n".encode() + bytes(8 << 20))
+                return b"".join(iter(lambda: client.recv(65536), b""))
+
+        answer = await asyncio.to_thread(send_all_and_read)
+        assert answer.startswith(b"HTTP/1.1 400 ") and answer.endswith(b"and POST /v1/actions\n")
+        while server._listener._connected:
+            await asyncio.sleep(0.01)
+
+    served(test, limits=Limits(close_seconds=1000.0))
+
+
+def test_what_follows_a_refused_request_is_thrown_away() -> None:
+    async def test(server: PolicyServer) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n" + bytes(1 << 20))
+        assert (await asyncio.wait_for(reader.read(), 120)).endswith(b"OK\n")
+        writer.close()
+        while server._listener._connected:
+            await asyncio.sleep(0.01)
+
+    served(test, limits=Limits(close_seconds=1000.0))
 
 
 @pytest.mark.parametrize("version", ["HTTP/1.0", "HTTP/2.0", "HTTP/9", "http/1.1", ""])

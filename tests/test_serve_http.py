@@ -285,6 +285,38 @@ def test_half_requests_are_cut_and_say_so() -> None:
     served(test, limits=Limits(handshake_seconds=0.2, message_seconds=0.2))
 
 
+def test_a_client_that_shuts_its_sending_side_is_told_to_keep_it_open() -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        for body in (JSON_OBSERVATION, {**JSON_OBSERVATION, "prompt": "hold"}):
+            for wire in (wire_of(body), wire_of(body)[:-3]):
+                reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+                writer.write(wire)
+                writer.write_eof()
+                answer = await reader.read()
+                assert answer.startswith(b"HTTP/1.1 400 ") and b"keep it open until that has come" in answer, answer
+                writer.close()
+        policy.release.set()
+
+    served(test)
+
+
+def test_a_refused_post_is_logged_and_counted_once(caplog: pytest.LogCaptureFixture) -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        wire = wire_of(JSON_OBSERVATION, target="/v1/action")
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        for part in (wire[:3], wire[3:80], wire[80:] + wire):
+            writer.write(part)
+            await asyncio.sleep(0.01)
+        assert b" 404 " in await reader.read()
+        writer.close()
+        while server._listener._connected:
+            await asyncio.sleep(0.01)
+        assert [record.getMessage().count("alone") for record in caplog.records] == [1]
+        assert server.metrics.errors_so_far() == {"malformed": 1}
+
+    served(test)
+
+
 def test_a_full_queue_is_429_and_a_client_that_leaves_takes_nothing_along() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         held = asyncio.ensure_future(post(server, {**JSON_OBSERVATION, "prompt": "hold"}))

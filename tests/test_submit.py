@@ -74,7 +74,7 @@ def test_a_backends_error_reaches_the_future(policy: UnifiedPolicy) -> None:
 def test_other_backends_say_so_or_run_at_once_if_asked(policy: UnifiedPolicy) -> None:
     obs = policy.example_observation()
     with pytest.raises(
-        ConfigError, match=r"'pytorch' runs one observation at a time: take backend 'tensorrt_pipelined'"
+        ConfigError, match=r"one observation at a time: submit\(…, serially=True\) runs it before submit returns$"
     ):
         policy.submit(obs, seed=0)
     future = policy.submit(obs, seed=0, serially=True)

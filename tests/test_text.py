@@ -1,10 +1,15 @@
 """Numbers and names as people read them."""
 
 import math
+import re
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from turbopi.support.text import counted, data_size, denoising, did_you_mean, names_known, significant
+from turbopi.realtime.chunk import too_far
+from turbopi.support.action_groups import action_groups
+from turbopi.support.text import counted, data_size, denoising, did_you_mean, kind_of, names_known, significant
 
 
 @pytest.mark.parametrize(
@@ -69,3 +74,18 @@ def test_known_names_come_behind_what_was_probably_meant() -> None:
 def test_one_of_a_thing_has_no_plural() -> None:
     assert [counted(number, "step") for number in (0, 1, 2)] == ["0 steps", "1 step", "2 steps"]
     assert [denoising({"num_denoising_steps": steps}) for steps in (1, 10)] == ["1 step", "10 steps"]
+
+
+def test_a_type_has_its_article() -> None:
+    values: tuple[object, ...] = (7, [], {}, "a", None, object(), np.zeros(1))
+    assert list(map(kind_of, values)) == ["an int", "a list", "a dict", "a str", "None", "an object", "an ndarray"]
+    refusing = re.compile(r"\ba \{type\(\w+\)\.__name__\}")
+    root = Path(__file__).resolve().parent.parent
+    assert not [path for path in (root / "src/turbopi").rglob("*.py") if refusing.search(path.read_text())]
+
+
+def test_actions_without_names_have_one_name_everywhere() -> None:
+    (group,) = action_groups("arm", 3)
+    assert list(group.names.values()) == ["action 0", "action 1", "action 2"]
+    moved = too_far(np.array([[0.0, 0.0], [0.0, 9.0]]), None, np.array(1.0))
+    assert moved is not None and moved.startswith("action 1 moves by 9")

@@ -70,3 +70,22 @@ def test_no_identifier_has_a_private_word() -> None:
 def test_no_file_name_has_a_private_word() -> None:
     names = [path.relative_to(ROOT) for path in tracked(".") if not path.is_relative_to(ROOT / "benchmarks/results")]
     assert not {str(name) for name in names for part in name.parts if private_words(part)}
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="this is no clone")
+def test_no_message_calls_a_matmul_a_product() -> None:
+    """Kernels name what they are made of; what users read is the field's word."""
+    found = set()
+    for path in tracked("src/turbopi/*.py"):
+        text = path.read_text(encoding="utf-8")
+        if "product" not in text or path.relative_to(ROOT / "src/turbopi").parts[0] in ("kernels", "engine", "tune"):
+            continue
+        tree = ast.parse(text)
+        lines = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
+        strings = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in lines]
+        found |= {
+            one.value
+            for one in strings
+            if isinstance(one.value, str) and re.search(r"\bproducts? | products?\b", one.value)
+        }
+    assert not found

@@ -20,7 +20,7 @@ from turbopi.config import ModelConfig, Network
 from turbopi.engine.graph import preparing
 from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import TIERS, WEIGHTS_ALONE, format_of
+from turbopi.quantization.plan import EIGHT_BITS, TIERS, WEIGHTS_ALONE, format_of
 from turbopi.support import extensions
 from turbopi.support.errors import BackendUnavailable, ConfigError
 
@@ -247,11 +247,17 @@ def _untried(device: torch.device, precision: Precision, model: Network | None) 
 
 
 def qualified(
-    device: torch.device, precision: Precision, model: Network, *, bar: bool = False, writes: bool = False
+    device: torch.device,
+    precision: Precision,
+    model: Network,
+    *,
+    bar: bool = False,
+    writes: bool = False,
+    kept: bool = False,
 ) -> None:
     """Where "auto" could take `fused` on a GPU that Turbo-Pi's tests never ran on, find out once whether it should.
 
-    Raises BackendUnavailable where `fused` fails in a precision that no other backend has.
+    Raises BackendUnavailable where `fused` fails in a precision that no other backend has. kept: as `check`.
     """
     if (
         (writes and precision not in TIERS)
@@ -265,14 +271,15 @@ def qualified(
         what = f"backend 'fused' for {family_of(model).label} in {precision} on {torch.cuda.get_device_name(device)}"
         with qualifying.shown(bar, what, qualifying.SECONDS) as tell:
             verdict = qualifying.qualify(device, precision, model, tell=tell)
-    check_verdict(verdict, file_of(device, precision, model))
+    check_verdict(verdict, file_of(device, precision, model), kept=kept)
 
 
-def check_verdict(verdict: Verdict, file: Path) -> None:
-    """Raise BackendUnavailable if nothing is to run in its precision."""
+def check_verdict(verdict: Verdict, file: Path, *, kept: bool = False) -> None:
+    """Raise BackendUnavailable if nothing is to run in its precision. kept: as `check`."""
     if verdict.taken is None:
+        other = "take the checkpoint that the folder was made from" if kept else "take precision 'bf16'"
         raise BackendUnavailable(
-            f"{verdict.precision} can't run on {verdict.gpu}: {verdict.summary}; take 'bf16', and "
+            f"{verdict.precision} can't run on {verdict.gpu}: {verdict.summary}; {other}, and "
             f"{verdict.issue(file)}; backend 'fused' by name runs it all the same"
         )
 
@@ -280,6 +287,8 @@ def check_verdict(verdict: Verdict, file: Path) -> None:
 def refusal(name: str, device: torch.device, precision: Precision, model: Network) -> str | None:
     """Why a backend can't run a model on a device in a precision, whatever was qualified; None if it can."""
     cls = class_for(name, model)
+    if not _is_for(precision, model):
+        return _not_for(precision, model)
     return _unavailable(cls, device) or cls.unavailable_in(device, precision) or _refuses(cls, model, precision)
 
 
@@ -291,30 +300,60 @@ def checked_precision(precision: str) -> Precision:
     raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
 
 
-def check(name: str, device: torch.device, precision: Precision) -> None:
-    """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
+def check(
+    name: str, device: torch.device, precision: Precision, model: Network | None = None, *, kept: bool = False
+) -> None:
+    """Raise ConfigError for an unknown name or precision, or one that isn't the model's; BackendUnavailable where the
+    backend can't run the model or on the device.
+
+    model  None: one of Pi0 or Pi0.5
+    kept   whether its weights are there in this precision alone
+    """
     checked_precision(precision)
-    cls = class_of(name)
+    cls, given, model = class_of(name), model, model or ModelConfig()
+    if given is not None and not _is_for(precision, model):
+        raise ConfigError(f"{_not_for(precision, model)}{_instead(device, precision, model, kept)}")
     if precision not in (own := all_precisions(name)):
-        if precision != WEIGHTS_ALONE:
-            raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}")
-        raise ConfigError(
-            f"backend {name!r} doesn't run in {precision!r}: models that write their actions as tokens (Pi0-FAST) do, "
-            "in backend 'cuda_graph' on an NVIDIA GPU"
-        )
+        where = " (models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU)"
+        where *= precision == WEIGHTS_ALONE
+        raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}{where}")
+    if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
+        raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
-    if precision in TIERS:
-        if reason is not None and device.type != "cuda":
-            format = format_of(precision)
-            which = "8.x, 9.0 or 12.x" if format.name == "int8" else "8.9 or newer"
-            reason = (
-                f"{precision} needs an NVIDIA GPU of compute capability {which}; take precision 'bf16', or to judge "
-                f"{format.label} without such a GPU backend 'emulated_{format.name}'"
-            )
-        elif (other_gpu := cls.unavailable_in(device, precision)) is not None:
-            reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
+    if precision in EIGHT_BITS and reason is not None and device.type != "cuda":
+        which = {"int8": "8.x, 9.0 or 12.x", WEIGHTS_ALONE: "8.0 or newer"}.get(precision, "8.9 or newer")
+        reason = f"{precision} needs an NVIDIA GPU of compute capability {which}"
+        reason += _instead(device, precision, model, kept)
+    elif precision in TIERS and (other_gpu := cls.unavailable_in(device, precision)) is not None:
+        reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
+        reason += _instead(device, precision, model, kept)
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")
+
+
+def _is_for(precision: Precision, model: Network) -> bool:
+    """Whether a backend runs models of this family in this precision, on some device."""
+    family = family_of(model)
+    if precision == WEIGHTS_ALONE:
+        return family.reader is not None
+    return family.planned or precision not in TIERS
+
+
+def _not_for(precision: Precision, model: Network) -> str:
+    return f"precision {precision!r} isn't for {family_of(model).label}"
+
+
+def _instead(device: torch.device, precision: Precision, model: Network, kept: bool) -> str:
+    """What to do where one of `EIGHT_BITS` can't run: what this model can on this device. Empty if that is nothing."""
+    if kept:
+        return ""
+    runs: dict[str, Precision] = {"cuda_graph": WEIGHTS_ALONE, "fused": "fp8" if precision == "int8" else "int8"}
+    others = [one for name, one in runs.items() if _is_for(one, model) and refusal(name, device, one, model) is None]
+    advice = "; take precision " + " or ".join(map(repr, ("bf16", *others)))
+    if device.type != "cuda" and precision in TIERS and _is_for(precision, model):
+        format = format_of(precision)
+        advice += f", or to judge {format.label} without such a GPU backend 'emulated_{format.name}'"
+    return advice
 
 
 def create(

@@ -75,6 +75,7 @@ class Backend(ABC):
     runs_batches    whether it runs a batch sooner than its observations one by one, by `begin_batch`
     batch_forms     those of `forms`, beside "plain", of which it runs several together
     submits         whether it has `submit`: several observations may be in flight
+    instead         what has every form and horizon that this one refuses, on a device and for models that it runs
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
                     `engine.plan.cold_call`. Set by the policy; a backend that does nothing of the kind needn't look
     reader          of a model that writes its actions as tokens: what makes actions of them. Set by the policy
@@ -90,6 +91,7 @@ class Backend(ABC):
     batch_forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
     submits: ClassVar[bool] = False
     writes: ClassVar[bool] = False
+    instead: ClassVar[str] = "backend 'pytorch'"
     strict = False
     reader: AnswerReader | None = None
     writer: TextWriting | None = None
@@ -141,7 +143,7 @@ class Backend(ABC):
         """Why it can't run a model of this family; None if it can. Here: it runs what the engine has a plan for."""
         if (family := family_of(config)).planned:
             return None
-        return f"backend {cls.name!r} has no plan for {family.label}; take backend 'pytorch' or 'cuda_graph'"
+        return f"backend {cls.name!r} has no plan for {family.label}; take backend 'auto'"
 
     @classmethod
     def refuses_form(cls, form: Form) -> str | None:
@@ -151,24 +153,21 @@ class Backend(ABC):
         if form == "solver":
             return (
                 f"backend {cls.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
-                "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
+                f"time grid 'uniform', or take {cls.instead}"
             )
         if form == "two_prompts":
             return (
-                f"backend {cls.name!r} has no guidance by a second prompt; take backend 'fused', 'cuda_graph' or "
-                "'pytorch', or guidance 1, which is the prompt with its tag alone, or 0, which is the one without"
+                f"backend {cls.name!r} has no guidance by a second prompt; take guidance 1, which is the prompt with "
+                f"its tag alone, or 0, which is the one without, or take {cls.instead}"
             )
         if form == "two_prompts_jacobian":
             return (
                 f"backend {cls.name!r} has no guidance by the true Jacobian (rtc) together with guidance by a second "
-                "prompt; take mode rtc_identity or rtc_trained, guidance 1 or 0, or backend 'pytorch'"
+                "prompt; take mode rtc_identity or rtc_trained, or guidance 1 or 0"
             )
         whats = {"jacobian": "guidance by the true Jacobian", "noise": "chosen noise (paint)"}
         what = whats.get(form, "times, held actions or guidance by token")
-        return (
-            f"backend {cls.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
-            "leave out conditioning and previous"
-        )
+        return f"backend {cls.name!r} has no {what}; leave out conditioning and previous, or take {cls.instead}"
 
     def check_conditioning(self, conditioning: Conditionings) -> None:
         """Raise ObservationError for a conditioning of a form that the backend doesn't have."""
@@ -182,7 +181,7 @@ class Backend(ABC):
             return None
         return (
             f"backend {self.name!r} has engines for the config's action horizon of {self.config.action_horizon}, not "
-            f"for {horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
+            f"for {horizon}; leave the horizon out, or take {self.instead}"
         )
 
     def prepare_text(self, text: TextConfig, head: Tensor | None) -> None:
@@ -262,9 +261,10 @@ class Backend(ABC):
 
     def submit(self, observation: Observation, noise: Tensor, num_steps: int) -> "Future[Sample]":
         """`sample` of one observation that returns at once."""
+        pipelined = self.device.type == "cuda" and self.precision == "bf16" and family_of(self.config).planned
         raise ConfigError(
-            f"backend {self.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
-            "or submit(…, serially=True) to run it before submit returns"
+            f"backend {self.name!r} runs one observation at a time: submit(…, serially=True) runs it before submit "
+            f"returns{', and backend tensorrt_pipelined has two in flight' * pipelined}"
         )
 
     # -- parts of a call, by which a backend is judged -----------------------------------------------------------------

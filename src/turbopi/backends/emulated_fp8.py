@@ -26,6 +26,7 @@ class EmulatedFp8Backend(PyTorchBackend):
     precisions: ClassVar[tuple[Precision, ...]] = FP8_TIERS
     forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # rounding has no derivative
     writes: ClassVar[bool] = False
+    instead: ClassVar[str] = "backend 'pytorch' with precision 'f32'"
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(load)

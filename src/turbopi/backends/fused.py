@@ -67,6 +67,7 @@ class FusedBackend(CudaGraphBackend):
     _kept_expert: Mapping[str, ScaledMatrix] = MappingProxyType({})  # in eight bits, of a folder that has them so
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
+    instead: ClassVar[str] = "backend 'pytorch' with precision 'bf16'"
 
     def load_weights(self, load: LoadState) -> None:
         given = self._quantization
@@ -99,10 +100,8 @@ class FusedBackend(CudaGraphBackend):
 
         capability = torch.cuda.get_device_capability(device)
         if precision == "int8":
-            reason = int8_refusal(capability)
-            return None if reason is None else f"{reason}; use 'fp8'"
-        reason = fp8_refusal(capability)
-        return None if reason is None else f"{reason}; use 'bf16', or 'int8'"
+            return int8_refusal(capability)
+        return fp8_refusal(capability)
 
     def describe(self) -> dict[str, Any]:
         described = super().describe() | {"tiles": self._tiles.about}
@@ -394,6 +393,8 @@ class FusedBackend(CudaGraphBackend):
     def _explain(self, error: RuntimeError) -> None:
         for kernel in self._kernels.values():
             if isinstance(kernel, Watched) and (why := kernel.why_it_trapped()) is not None:
+                other = "" if self._plan is None else " with precision 'bf16'"
                 raise DeviceLost(
                     f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"
+                    f"{other}"
                 ) from error

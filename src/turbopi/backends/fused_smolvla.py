@@ -69,7 +69,7 @@ class FusedSmolVLABackend(CapturedBackend):
         if (refused := super().refuses_model(config)) is not None:
             return refused
         why = smolvla.refusal(config)
-        return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'cuda_graph'"
+        return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'auto'"
 
     def load_weights(self, load: LoadState) -> None:
         super().load_weights(

@@ -179,7 +179,7 @@ class CapturedTokensBackend(_Tokens, CapturedBackend):
 
             why = token.refuses(self.config)
         if int8 and why is not None:
-            raise BackendUnavailable(f"INT8 weights are read by the engine's kernels alone: {why}; take 'bf16'")
+            raise BackendUnavailable(f"the engine's kernels alone read INT8 weights: {why}; take precision 'bf16'")
         super().load_weights(load)
         if why is None:
             self._joined = token.JoinedWeights(self.model, int8=int8)

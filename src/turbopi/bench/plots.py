@@ -97,11 +97,12 @@ def _steps(document: BenchDocument) -> Figure:
         total = [result.milliseconds["total"] for result in results]
         median = np.array([one.p50 for one in total])
         spread = [median - [_low(one) for one in total], np.array([one.p95 for one in total]) - median]
-        text = f"{label(line)}, H={line.horizon}: {line.a_ms:.2f} + {line.b_ms:.3f} · steps"
+        shaped = main.of_horizon and f", H={line.horizon}"
+        text = f"{label(line)}{shaped}: {line.a_ms:.2f} + {line.b_ms:.3f} · {main.unit}"
         axes.errorbar(steps, median, np.maximum(spread, 0), fmt="o", color=f"C{index}", capsize=3, label=text)
         ends = np.array([0, steps.max()])
         axes.plot(ends, line.a_ms + line.b_ms * ends, color=f"C{index}", linewidth=1)
-    axes.set_xlabel("denoising steps")
+    axes.set_xlabel(main.unit if main.writes_tokens else "denoising steps")
     axes.set_ylabel("whole call, median [ms]")
     axes.set_ylim(bottom=0)
     axes.set_title(f"{as_text(document.model)}: {main.cameras} cameras, {main.prompt_tokens} tokens", fontsize=10)

@@ -14,7 +14,7 @@ def floors_line(precision: str, floor: Floors) -> str:
     """The machine's floors in one line."""
     parts = [
         f"copy {_rate(floor.copy_bytes_per_second)}B/s",
-        f"matrix product {_rate(floor.matmul_flops_per_second)}FLOP/s",
+        f"matmul {_rate(floor.matmul_flops_per_second)}FLOP/s",
     ]
     for took, what in ((floor.launch_us, "a launch in a graph"), (floor.barrier_us, "a barrier of the whole grid")):
         if took is not None:
@@ -118,18 +118,19 @@ def _all(document: BenchDocument) -> list[str]:
                 for n in steps
             ]
 
-        head = ["steps", *map(str, steps)]
+        head = [document.main_job.unit, *map(str, steps)]
         lines += [f"## {name}: whole call, median (p95)", ""]
         lines += _table(head, ([shape, *cells(by_steps)] for shape, by_steps in rows.items()))
     return lines
 
 
 def _linear(document: BenchDocument) -> list[str]:
+    main = document.main_job
     rows = [
         [
             label(line),
-            f"{line.cameras} cameras, {line.prompt_tokens} tokens, H={line.horizon}",
-            f"{line.a_ms:.2f} + {line.b_ms:.3f} · steps",
+            f"{line.cameras} cameras, {line.prompt_tokens} tokens" + (main.of_horizon and f", H={line.horizon}"),
+            f"{line.a_ms:.2f} + {line.b_ms:.3f} · {main.unit}",
             f"{line.worst_ms:.2f}",
         ]
         for line in document.linear or ()

@@ -1,5 +1,6 @@
 """One benchmark run: floors, then every backend on every job, then the errors, as one plain document."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from turbopi.bench.measure import (
     error_against,
     for_job,
     measure_calls,
+    writes_tokens,
 )
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models, warnings_on
@@ -29,6 +31,7 @@ from turbopi.bench.work import MODEL_SIZE, Job, Join, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import Solver, TimeGrid
 from turbopi.engine.graph import collect_and_empty_cache
+from turbopi.policy.kept_precision import check_backend
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.plan import TIERS, WEIGHTS_ALONE
 from turbopi.robots import Robot
@@ -62,6 +65,7 @@ class BenchPlan:
     robot: str | Robot | None = None  # whose own observations are measured; None: random ones of the jobs' shapes
     solver: Solver | None = None  # None: the checkpoint's
     time_grid: TimeGrid | None = None  # None: the checkpoint's
+    writes_tokens: bool = False  # what `run` sets: see Job
 
     @property
     def main(self) -> Job:
@@ -79,9 +83,10 @@ class BenchPlan:
             *(MODEL_SIZE if MODEL_SIZE in self.image_sizes else self.image_sizes[0]),
             "none" if "none" in self.joins else self.joins[0],
             pick(self.batches, usual.batch),
+            self.writes_tokens,
         )
 
-    def check(self, device: torch.device) -> None:
+    def check(self, device: torch.device, checkpoint: Checkpoint | None = None) -> None:
         """Raise ConfigError or BackendUnavailable for a backend or precision that can't run, before anything is run."""
         if not self.backends or not self.precisions:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
@@ -95,14 +100,17 @@ class BenchPlan:
                 raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
         for precision, name in itertools.product(self.precisions, named):
             if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.all_precisions(name):
-                backends.check(name, device, precision)
+                if checkpoint is None:
+                    backends.check(name, device, precision)
+                else:
+                    check_backend(name, device, precision, checkpoint)
 
     def jobs(self) -> Iterator[Job]:
         for horizon, cameras, size, tokens in itertools.product(
             self.horizons, self.cameras, self.image_sizes, self.prompt_tokens
         ):
             for steps, join, batch in itertools.product(self.steps, self.joins, self.batches):
-                yield Job(cameras, tokens, horizon, steps, *size, join, batch)
+                yield Job(cameras, tokens, horizon, steps, *size, join, batch, self.writes_tokens)
 
     def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
         """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
@@ -144,7 +152,8 @@ def run(
     gets what there is after each job, marked as "unfinished".
     """
     progress = progress or BenchProgress()
-    plan.check(device)
+    plan = dataclasses.replace(plan, writes_tokens=writes_tokens(checkpoint.config))
+    plan.check(device, checkpoint)
     progress.doing("measuring this machine's floors")
     floors: dict[str, Floors] = {precision: measure_floors(device, precision) for precision in plan.precisions}
     collect_and_empty_cache()

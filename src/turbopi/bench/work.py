@@ -29,7 +29,11 @@ def _written(usual: int) -> int:
 
 
 class Job(Struct, frozen=True, omit_defaults=True):
-    """One benchmark point. `prompt_tokens` counts valid tokens, the state's among them."""
+    """One benchmark point. `prompt_tokens` counts valid tokens, the state's among them.
+
+    writes_tokens  of a model that writes its actions as tokens: `steps` is how many it writes, and `horizon` means
+                   nothing; not in files of others
+    """
 
     cameras: _Count = _written(2)
     prompt_tokens: _Count = _written(48)
@@ -39,12 +43,25 @@ class Job(Struct, frozen=True, omit_defaults=True):
     image_height: _Count = MODEL_SIZE[1]
     join: Join = "none"  # not in files where it is none
     batch: _Count = 1  # observations of one call; not in files where it is 1
+    writes_tokens: bool = False
 
     def __str__(self) -> str:
         images = f"{self.cameras} cameras{self.of_size}"
-        return (
-            f"{images}, {self.prompt_tokens} tokens, H={self.horizon}{self.of_batch}, {self.steps} steps{self.joined}"
-        )
+        return f"{images}, {self.prompt_tokens} tokens{self.of_horizon}{self.of_batch}, {self.of_steps}{self.joined}"
+
+    @property
+    def of_horizon(self) -> str:
+        """`H=10` behind a comma; nothing where it means nothing."""
+        return "" if self.writes_tokens else f", H={self.horizon}"
+
+    @property
+    def unit(self) -> str:
+        """Of `steps`."""
+        return "tokens written" if self.writes_tokens else "steps"
+
+    @property
+    def of_steps(self) -> str:
+        return f"{self.steps} {self.unit}"
 
     @property
     def joined(self) -> str:

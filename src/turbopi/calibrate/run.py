@@ -25,6 +25,7 @@ from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.emulate import NO_SIGNAL, RoundedWeights, delta_cosine, has_signal, relative_rms, rounded
 from turbopi.engine.graph import collect_and_empty_cache
+from turbopi.models import family_of
 from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 from turbopi.policy import shipped
 from turbopi.policy.examples import NoisyExample, with_noises
@@ -35,7 +36,7 @@ from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.plan import refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
-from turbopi.support.errors import CheckpointError
+from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import plain_document
 
 TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
@@ -68,11 +69,25 @@ class Progress:
     advance: Callable[[], None] = field(default=lambda: None)
 
 
+def check_family(checkpoint: Checkpoint) -> None:
+    """Raise ConfigError for a model that no calibration is for, before anything is asked for or loaded."""
+    if (family := family_of(checkpoint.config.model)).planned:
+        return
+    other = ", or on an NVIDIA GPU in 'int8-weights', which needs none" if family.reader is not None else ""
+    raise ConfigError(
+        f"calibrations are for Pi0 and Pi0.5 alone, and {checkpoint.config.name} is {family.label}: run it in "
+        f"precision 'bf16'{other}"
+    )
+
+
 def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | None = None) -> Quantization:
-    """Choose scales and sites for a checkpoint. Raises ObservationError for observations that can't be used,
-    CheckpointError where the reference itself isn't finite.
+    """Choose scales and sites for a checkpoint.
+
+    Raises what `check_family` raises, ObservationError for observations that can't be used, CheckpointError where the
+    reference itself isn't finite.
     """
     progress, started = progress or Progress(), time.perf_counter()
+    check_family(checkpoint)
     if settings.arguments.get("robot") is None:
         checkpoint = shipped.with_libero_stats(checkpoint)
     arguments = dict(settings.arguments) | {"backend": "pytorch", "precision": "f32"}
@@ -176,12 +191,12 @@ def calibrate_model(
     method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
     scales = _scales(everywhere, histograms, method, format)
 
-    progress.begin("products of every site", 1)
+    progress.begin("matmuls of every site", 1)
     products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps, weights)
     progress.advance()
     kept = {str(site): f"not possible: {why}" for site, why in impossible.items()}
     kept |= {
-        name: f"its products alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
+        name: f"its matmuls alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
     }
     groups = _groups(eligible, scales, kept, selection, progress)
     kept |= _keep_groups(eligible, scales, kept, groups, selection, settings.target, progress)

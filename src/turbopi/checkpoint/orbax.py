@@ -25,6 +25,7 @@ from turbopi.checkpoint.source import Shape, listing
 from turbopi.support.errors import CheckpointError
 from turbopi.support.reading import Fields, files_below, is_integer, one_line, open_file, parse_json, read_json
 from turbopi.support.reading.files import HEAD_BYTES, failed_download
+from turbopi.support.text import kind_of
 
 MANIFEST = "manifest.ocdbt"
 _DTYPES = {"float32": "F32", "<f4": "F32", "bfloat16": "BF16", "float16": "F16", "<f2": "F16"}
@@ -188,7 +189,7 @@ def _chunks_of(arrays: Mapping[str, Any], keys: list[str]) -> Counter[str]:
 def _fields(description: bytes, where: str) -> Fields:
     content = parse_json(description, f"{where}: its description")
     if not isinstance(content, dict):
-        raise CheckpointError(f"{where}: its description is a {type(content).__name__}; expected an object")
+        raise CheckpointError(f"{where}: its description is {kind_of(content)}; expected an object")
     return Fields(content, where)
 
 

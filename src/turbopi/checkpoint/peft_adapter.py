@@ -42,8 +42,6 @@ _NO_MATTER = {
     *("modules_to_save", "peft_version", "qalora_group_size", "revision", "runtime_config", "target_modules"),
     *("task_type", "loftq_config"),
 }
-# init_lora_weights that set A and B alone; others (PiSSA, LoftQ, ...) change the base's weights, too
-_PLAIN_STARTS = (True, False, "gaussian", "eva", "orthogonal")
 _REPEATS, _REPEATED_GROUP = re.compile(r"[*+?{]"), re.compile(r"\)[*+?{]")  # a hostile one matches for hours
 _ADVICE = "Merge it in LeRobot's environment (peft's merge_and_unload), save the whole policy, and give that folder"
 
@@ -159,8 +157,16 @@ class PeftSource:
         if name is None:
             return ""
         alone = name != EMBEDDING or head is None or head in shapes  # else the base's table is its head, too
-        if name not in shapes or not alone:
-            raise CheckpointError(f"{self._where}: {stored.key} is for {key}, which the base model doesn't have")
+        if head is not None and ((name == head and head not in shapes) or not alone):
+            raise CheckpointError(
+                f"{self._where}: {stored.key} is for one of lm_head and embed_tokens, and the base model has one table "
+                f"for both. {_ADVICE}"
+            )
+        if name not in shapes:
+            raise CheckpointError(
+                f"{self._where}: {stored.key} is for {key}, which the base model doesn't have; is it the model that "
+                "the adapter was trained on?"
+            )
         return name
 
     def _check_new(self, name: str, stored: Stored) -> None:
@@ -185,7 +191,7 @@ class _Scales:
             raise CheckpointError(f"{config.where}: peft_type is {shown(kind)}; Turbo-Pi merges LORA. {_ADVICE}")
         start = config.values.get("init_lora_weights", True)
         odd = {key: value for key, value in config.values.items() if value and key not in {*_READ, *_NO_MATTER}}
-        if start not in _PLAIN_STARTS:
+        if not _leaves_base(start):
             odd["init_lora_weights"] = start
         if odd:
             requested = ", ".join(f"{key} = {shown(value)}" for key, value in odd.items())
@@ -220,6 +226,15 @@ class _Scales:
             except re.error as error:
                 raise CheckpointError(f"{self._config.where}: {key} has {shown(pattern)}: {error}") from error
         return found
+
+
+def _leaves_base(start: object) -> bool:
+    """Whether an init_lora_weights sets A and B alone, read as by peft, which ignores the case of "gaussian" and takes
+    null for false; others (PiSSA, LoftQ, ...) change the base's weights, too.
+    """
+    if isinstance(start, str) and start.lower() == "gaussian":
+        return True
+    return not start or start is True or start in ("eva", "orthogonal")
 
 
 def _matched(patterns: Mapping[re.Pattern[str], float], module: str, default: float) -> float:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -19,12 +20,27 @@ from turbopi.support.reading import listing
 PIECE_BYTES = 8 * 2**20
 
 Shape = tuple[int, ...]
+_RANDOM = "random weights, "
+_REPORTED: "WeakKeyDictionary[WeightSource, set[str]]" = WeakKeyDictionary()  # notes that were reported
 RANDOM_KEY = "turbopi_random_weights"  # in the header of files that hold random weights: they stay marked
 
 
 def random_note(random: str) -> str:
     """What every reader should know of random weights."""
-    return f"random weights, {random}: actions mean nothing"
+    return f"{_RANDOM}{random}: actions mean nothing"
+
+
+def mark_random_reported(source: "WeightSource") -> None:
+    """Somebody has said in other words that these weights are random."""
+    _REPORTED.setdefault(source, set()).update(note for note in source.notes if note.startswith(_RANDOM))
+
+
+def unreported_notes(source: "WeightSource") -> list[str]:
+    """The notes that weren't reported yet, which now count as reported: however many policies are made, once."""
+    reported = _REPORTED.setdefault(source, set())
+    found = [note for note in source.notes if note not in reported]
+    reported.update(found)
+    return found
 
 
 @dataclass(frozen=True)

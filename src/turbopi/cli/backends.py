@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import torch
 
     from turbopi.backends import Precision
-    from turbopi.config import PolicyConfig
+    from turbopi.checkpoint import Checkpoint
 
 DeviceOption = Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")]
 PrecisionOption = Annotated[
@@ -47,26 +47,30 @@ def resolve_gpu(device: str, purpose: str) -> "torch.device":
     return resolved
 
 
-def list_backends(device: str, precision: str, config: "PolicyConfig | None" = None) -> dict[str, Any]:
+def list_backends(device: str, precision: str, checkpoint: "Checkpoint | None" = None) -> dict[str, Any]:
     """Whether each backend can run here, in which precisions, and why not, as JSON values. Raises ConfigError.
 
-    config: a checkpoint's, for what runs its model; without one, a Pi0.5's.
+    checkpoint: for what runs its model; without one, a Pi0.5's.
     """
     from turbopi import backends as registry
+    from turbopi.policy.kept_precision import check_backend
 
     resolved = registry.resolve_device(device)
     tier = registry.checked_precision(precision)
-    chosen, why = registry.choose(resolved, tier, *(() if config is None else (config.model,)))
+    chosen, why = registry.choose(resolved, tier, *(() if checkpoint is None else (checkpoint.config.model,)))
     why = as_typed(why)
     try:
-        registry.check(chosen, resolved, tier)
+        if checkpoint is None:
+            registry.check(chosen, resolved, tier)
+        else:
+            check_backend(chosen, resolved, tier, checkpoint)
         runs = True
-    except BackendUnavailable as error:
-        why, runs = f"auto can't run in {precision} here: {error}", False
+    except (BackendUnavailable, ConfigError) as error:
+        why, runs = f"auto can't run in {precision} here: {as_typed(str(error))}", False
     listed = [
         {
             "name": spec.name,
-            "available": (reason := _why_not(spec.name, resolved, tier, config)) is None,
+            "available": (reason := _why_not(spec.name, resolved, tier, checkpoint)) is None,
             "reason": reason,
             "precisions": list(registry.precisions(spec.name)),
             "summary": spec.summary,
@@ -84,19 +88,17 @@ def list_backends(device: str, precision: str, config: "PolicyConfig | None" = N
     }
 
 
-def _why_not(name: str, device: "torch.device", tier: "Precision", config: "PolicyConfig | None") -> str | None:
+def _why_not(name: str, device: "torch.device", tier: "Precision", checkpoint: "Checkpoint | None") -> str | None:
     from turbopi import backends
-    from turbopi.quantization.plan import TIERS
+    from turbopi.checkpoint.quantized_folder import precision_kept
 
-    if (reason := backends.availability(name, device)) is not None or config is None:
+    kept = None if checkpoint is None else precision_kept(checkpoint)
+    if kept is not None and name != "fused" and name in backends.BACKENDS:
+        return f"the folder keeps its weights in {kept}, which backend 'fused' alone runs"
+    if (reason := backends.availability(name, device)) is not None or checkpoint is None:
         return reason
     own = backends.precisions(name)
-    if set(own) <= set(TIERS):
-        try:
-            _ = config.planned_model
-        except ConfigError:
-            return f"calibrations are for Pi0 and Pi0.5 alone, and this is a {config.model.kind}"
-    return backends.refusal(name, device, tier if tier in own else own[0], config.model)
+    return backends.refusal(name, device, tier if tier in own else own[0], checkpoint.config.model)
 
 
 def show_backends(found: dict[str, Any], output: Output) -> None:

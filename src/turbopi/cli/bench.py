@@ -258,6 +258,7 @@ def bench(
     # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
     with empty_caches() if ready else nullcontext():
         from turbopi import backends as registry
+        from turbopi.bench.measure import writes_tokens
         from turbopi.bench.run import BenchPlan, run
         from turbopi.checkpoint.quantized_folder import precision_kept
         from turbopi.policy.call_options import Denoising
@@ -277,6 +278,8 @@ def bench(
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
         names = _backends(_names(backends), tiers, resolved, opened)
         robot = options.make_robot()
+        if writes_tokens(opened.config) and horizons is not None:
+            raise ConfigError(f"--horizons: {opened.config.name} writes tokens, --steps of them, and has no horizon")
         axes["--image-size"] = image_size
         own = Denoising(1).changed(None, solver, typed_grid(time_grid), ConfigError)  # type: ignore[arg-type]
         if axes["--steps"] is None and isinstance(own.time_grid, tuple):
@@ -305,7 +308,7 @@ def bench(
             solver=None if solver is None else own.solver,
             time_grid=None if time_grid is None else own.time_grid,
         )
-        plan.check(resolved)
+        plan.check(resolved, opened)
         if ready and (plan.solver, plan.time_grid) != (None, None):
             raise ConfigError("--ready starts programs with openpi's steps: give it without --solver and --time-grid")
         if report is not None:
@@ -397,9 +400,10 @@ def _show(document: "BenchDocument", output: Output) -> None:
     for text in document.warnings or ():
         output.line(f"WARNING: {text}", "bold yellow")
     for line in document.linear or ():
+        shaped = document.main_job.of_horizon and f", H={line.horizon}"
         output.line(
-            f"{label(line)}, {line.cameras} cameras, {line.prompt_tokens} tokens, "
-            f"H={line.horizon}: {line.a_ms:.2f} + {line.b_ms:.3f} x steps ms, off by {line.worst_ms:.2f}"
+            f"{label(line)}, {line.cameras} cameras, {line.prompt_tokens} tokens{shaped}: {line.a_ms:.2f} + "
+            f"{line.b_ms:.3f} x {document.main_job.unit} ms, off by {line.worst_ms:.2f}"
         )
     for start in document.ready or ():
         for kind, took in (("cold", start.cold), ("cached", start.cached)):
@@ -415,7 +419,7 @@ def _show(document: "BenchDocument", output: Output) -> None:
 def _job(result: "Result") -> list[str]:
     job = result.job
     cameras, batch, joined = f"{job.cameras} cam{job.of_size}", job.of_batch.strip(", "), job.joined.strip(", ")
-    return [cameras, f"{job.prompt_tokens} tok", f"H={job.horizon}", batch, f"{job.steps} steps", joined]
+    return [cameras, f"{job.prompt_tokens} tok", job.of_horizon.strip(", "), batch, job.of_steps, joined]
 
 
 def _row(result: "Result") -> list[str]:

@@ -104,18 +104,18 @@ def calibrate(
     format = next((one for one in FORMATS.values() if one.name == precision), None)
     if format is None:
         raise ConfigError(f"--precision {precision!r} isn't what calibration is for; choose {' or '.join(FORMATS)}")
-    if out is None and (checkpoint is None or options.random_weights is not None):
-        raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
+    opened = options.open(checkpoint)
+    from turbopi.calibrate.run import Progress, Settings, check_family
+    from turbopi.calibrate.run import calibrate as run
     from turbopi.checkpoint.calibration import BESIDE
 
-    opened = options.open(checkpoint)
+    check_family(opened)
+    if out is None and (checkpoint is None or options.random_weights is not None):
+        raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
     out = out or Path(str(checkpoint)) / BESIDE[format.name]
     check_writable(out)
     replaced = _replaced(out)
     options.tell_if_random(opened, output)
-    from turbopi.calibrate.run import Progress, Settings
-    from turbopi.calibrate.run import calibrate as run
-
     arguments = {
         "num_denoising_steps": steps,
         "device": device,

@@ -23,9 +23,13 @@ class Capabilities:
     batch_modes: "tuple[JoinMode, ...]"
 
 
-def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capabilities:
-    """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does."""
+def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint", *, here: bool = True) -> Capabilities:
+    """Of the policy that `make_policy` will make. Raises ConfigError and BackendUnavailable, as that does.
+
+    here  whether it will be made on this machine: else nothing is said of that
+    """
     from turbopi import backends
+    from turbopi.checkpoint.quantized_folder import precision_kept
     from turbopi.policy.call_options import Denoising
     from turbopi.policy.chunk_conditioning import ChunkConditioning
     from turbopi.policy.kept_precision import check_backend
@@ -34,9 +38,11 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     device, precision = backends.resolve_device(fitting.device), fitting.precision_of(fitting.backend)
     model, name, writes = checkpoint.config.model, fitting.backend, checkpoint.config.writes_subtasks
     if name == "auto":
-        backends.qualified(device, precision, model, bar=sys.stderr.isatty(), writes=writes)  # type: ignore[arg-type]
+        bar, kept = sys.stderr.isatty(), precision_kept(checkpoint) is not None
+        backends.qualified(device, precision, model, bar=bar, writes=writes, kept=kept)  # type: ignore[arg-type]
         name = backends.choose(device, precision, model, writes=writes)[0]  # type: ignore[arg-type]
-    check_backend(name, device, precision, checkpoint)  # type: ignore[arg-type]
+    if here:
+        check_backend(name, device, precision, checkpoint)  # type: ignore[arg-type]
     cls = backends.class_for(name, model, writes=writes)
     requested = Denoising.of(checkpoint.config, *fitting.flow_arguments)
     no_pipeline: Any = None  # no observation is read
@@ -50,14 +56,16 @@ def capabilities_of(options: "PolicyOptions", checkpoint: "Checkpoint") -> Capab
     )
 
 
-def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "Checkpoint") -> None:
-    """Raise ConfigError for options of a server that the policy won't be able to follow."""
+def check_server(
+    server: ServerOptions, options: "PolicyOptions", checkpoint: "Checkpoint", *, here: bool = True
+) -> None:
+    """Raise ConfigError for options of a server that the policy won't be able to follow. here: `capabilities_of`'s."""
     if (server.execution, server.execution_horizon, server.delay_steps, server.max_batch) == (None,) * 4:
         return
     from turbopi.serve.calls import largest_batch
     from turbopi.serve.real_time import check_execution
 
-    offered = capabilities_of(options, checkpoint)
+    offered = capabilities_of(options, checkpoint, here=here)
     check_execution(server, offered.real_time, checkpoint.config.model.action_horizon)
     largest_batch(server, pipelined=offered.pipelined, batch_modes=offered.batch_modes)
 

@@ -68,7 +68,7 @@ def inspect(
         info = options.open(None).info()
     else:
         info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
-    refused = info.pop("config_error") if "config_error" in info and _is_said(options, info["path"]) else None
+    refused = info.pop("config_error") if "config_error" in info and _is_said(options, info) else None
     if "config_error" in info:
         info["config_error"] = as_typed(info["config_error"])
     if "robot" in info or options.robot is not None:
@@ -84,15 +84,17 @@ def inspect(
     output.document(info)
 
 
-def _is_said(options: RobotOptions, folder: str) -> bool:
-    """Whether what is wrong with the configuration was said by --config, or by a turbopi.json that can't be read."""
+def _is_said(options: RobotOptions, info: dict[str, Any]) -> bool:
+    """Whether what is wrong with the configuration was said by --config or a turbopi.json, whose name then begins the
+    message; else too little was said.
+    """
     from turbopi.checkpoint.settings import read_settings
 
     try:
-        read_settings("auto", Path(folder))
+        source = read_settings("auto", Path(info["path"])).source
     except ConfigError:
         return True
-    return options.config is not None
+    return options.config is not None or info["config_error"].startswith((f"{source}:", f"{source} is for "))
 
 
 def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str]) -> dict[str, Any]:
@@ -272,7 +274,8 @@ def _statistics_table(feature: str, stats: dict[str, Any], labels: list[dict[str
     shown = [name for name in ("q01", "q99", "mean", "std") if name in values]
     if "q01" not in values:
         shown = [name for name in ("min", "max", "mean", "std") if name in values]
-    labels = labels or [{"name": f"value {index}", "unit": ""} for index in range(stats["dim"])]
+    what = "action" if feature == "actions" else "value"
+    labels = labels or [{"name": f"{what} {index}", "unit": ""} for index in range(stats["dim"])]
     table = Table(title=f"{feature} in the training data", title_justify="left")
     table.add_column(feature, overflow="fold")
     if any(label["unit"] for label in labels):

@@ -165,13 +165,14 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
     from turbopi import backends
     from turbopi.checkpoint.calibration import calibration_of
     from turbopi.policy.call_options import checked_steps
+    from turbopi.policy.kept_precision import check_backend
     from turbopi.quantization.plan import TIERS
 
     device = backends.resolve_device(options.device)
     tiers = [variant.precision for variant in variants if variant.precision in TIERS]
     for variant in variants:
         checked_steps(variant.steps, ConfigError)
-        backends.check(variant.backend, device, variant.precision)  # type: ignore[arg-type]  # parsed
+        check_backend(variant.backend, device, variant.precision, checkpoint)  # type: ignore[arg-type]  # parsed
     if not tiers and (options.quantization is not None or options.fp8_parts is not None):
         raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8 or INT8, and none of these is")
     for tier in tiers:

@@ -214,7 +214,7 @@ class _Run:
         for group in action_groups(self.robot, dims):
             table.add_section()
             for index, name in group.names.items():
-                label = name if name == group.title or name.startswith("dim ") else f"{group.title} {name}"
+                label = name if name == group.title or name.startswith("action ") else f"{group.title} {name}"
                 table.add_row(label, group.unit, *(f"{value:+.3f}" for value in actions[:shown, index]))
         self.output.table(table)
 

@@ -73,7 +73,7 @@ def doctor(
     precision = precision or own_precision(opened) or "bf16"
     rows = list(examine(opened, about_it, tokenizer=tokenizer, port=port))
     works = all(row.level != "FAIL" for row in rows if row.name == "PyTorch")
-    found = list_backends(device, precision, None if opened is None else opened.config) if works else {}
+    found = list_backends(device, precision, opened) if works else {}
     width = max(len(row.name) for row in rows)
     for row in rows:  # lines and not a table, so that a command can be copied whole
         output.styled(f"[{STYLES[row.level]}]{row.level:<4}[/]  [bold]{row.name:<{width}}[/]  {escape(row.found)}")

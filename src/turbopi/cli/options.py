@@ -170,6 +170,9 @@ class WeightOptions:
         if checkpoint.random is not None:
             which = f"{self.random_weights}, " if self.random_weights is not None else ""
             output.line(f"RANDOM WEIGHTS ({which}{checkpoint.random}): the actions mean nothing.", "bold yellow")
+            from turbopi.checkpoint.source import mark_random_reported
+
+            mark_random_reported(checkpoint.source)
 
 
 @dataclass(frozen=True)

@@ -184,6 +184,7 @@ def _second(text: str | None, config: str | None, options: PolicyOptions, opened
             raise ConfigError("--against-config is for the checkpoint of --against, which wasn't given")
         return None
     from turbopi import backends
+    from turbopi.policy.kept_precision import check_backend
     from turbopi.quantization.plan import TIERS
     from turbopi.replay.report import Second, name_of
 
@@ -194,7 +195,7 @@ def _second(text: str | None, config: str | None, options: PolicyOptions, opened
     if config is not None:
         raise ConfigError(f"--against-config is for a checkpoint, and --against {text} is none")
     backend, precision, steps = way_to_run(text, options, "a checkpoint's folder")
-    backends.check(backend, backends.resolve_device(options.device), precision)  # type: ignore[arg-type]  # parsed
+    check_backend(backend, backends.resolve_device(options.device), precision, opened)  # type: ignore[arg-type]  # parsed
     own = replace(options, backend=backend, precision=precision, steps=steps)
     if precision not in TIERS:  # a calibration is for FP8 and INT8 alone
         own = replace(own, quantization=None, fp8_parts=None)

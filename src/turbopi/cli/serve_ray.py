@@ -234,7 +234,7 @@ def _open(requested: Requested, checkpoint: str | None, output: Output) -> "Chec
         )
     # replicas may run elsewhere
     anywhere = replace(requested.policy, backend="pytorch", precision="bf16", device="cpu")
-    check_server(replace(requested.server, max_batch=None), anywhere, opened)
+    check_server(replace(requested.server, max_batch=None), anywhere, opened, here=False)
     requested.policy.tell_if_random(opened, output)
     return opened
 

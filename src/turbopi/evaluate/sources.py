@@ -17,7 +17,7 @@ from turbopi.realtime.running_chunk import JoinMode
 from turbopi.realtime.wire import WireError, pack_parts, unpack
 from turbopi.support.errors import ActionError, ConfigError, TurboPiError
 from turbopi.support.reading import is_finite, shown
-from turbopi.support.text import denoising
+from turbopi.support.text import denoising, kind_of
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
@@ -266,7 +266,7 @@ def _for_next(result: Mapping[str, object]) -> dict[str, np.ndarray]:
 def _answer(result: object, *timings: str) -> Answer:
     """The actions, which may still be NaN, and the time. Raises PolicyRefused for whatever else this is."""
     if not isinstance(result, Mapping) or "actions" not in result:
-        found = f"the keys {shown(list(result))}" if isinstance(result, Mapping) else f"a {type(result).__name__}"
+        found = f"the keys {shown(list(result))}" if isinstance(result, Mapping) else kind_of(result)
         raise PolicyRefused(f"the policy's answer has no actions but {found}")
     try:
         actions = np.asarray(result["actions"])
@@ -314,7 +314,7 @@ def _unpacked(data: str | bytes, where: str) -> dict[str, object]:
     except WireError as error:
         raise PolicyRefused(f"the server at {where} doesn't speak openpi's protocol: {error}") from error
     if not isinstance(message, dict):
-        raise PolicyRefused(f"the server at {where} sent a {type(message).__name__} where a map should be")
+        raise PolicyRefused(f"the server at {where} sent {kind_of(message)} where a map should be")
     return message
 
 

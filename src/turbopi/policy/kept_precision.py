@@ -1,4 +1,4 @@
-"""Weights that a folder keeps in eight bits run in that precision alone, in one backend: said where they can't."""
+"""Whether a backend runs a checkpoint in a precision; weights kept in eight bits run in that one alone."""
 
 from pathlib import Path
 
@@ -7,18 +7,25 @@ import torch
 from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.checkpoint import Checkpoint
-from turbopi.checkpoint.quantized_folder import precision_kept
+from turbopi.checkpoint.quantized_folder import QuantizedOnly, precision_kept
 from turbopi.support.errors import BackendUnavailable
 
 
-def check_backend(name: str, device: torch.device, precision: Precision, checkpoint: str | Path | Checkpoint) -> None:
-    """`backends.check`, whose error also says so where the precision is what the folder keeps its weights in."""
+def check_backend(name: str, device: torch.device, precision: Precision, checkpoint: Checkpoint) -> None:
+    """`backends.check` for this checkpoint: what the error advises, it can do.
+
+    Raises QuantizedOnly too, where the folder keeps its weights for another backend or precision.
+    """
+    kept = precision_kept(checkpoint)
+    where = Path(str(checkpoint.path))
+    if kept is not None and name in backends.BACKENDS and (name, precision) != ("fused", kept):
+        raise QuantizedOnly(where, kept)
     try:
-        backends.check(name, device, precision)
+        backends.check(name, device, precision, checkpoint.config.model, kept=kept is not None)
     except BackendUnavailable as error:
-        if precision != precision_kept(checkpoint):
+        if kept is None:
             raise
         raise BackendUnavailable(
-            f"{error}. {getattr(checkpoint, 'path', checkpoint)} keeps its weights in {precision} alone: for another "
-            "precision or backend take the checkpoint that it was made from"
+            f"{error}. {where} keeps its weights in {precision} alone: for another precision or backend take the "
+            "checkpoint that it was made from"
         ) from error

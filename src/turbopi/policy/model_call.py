@@ -101,7 +101,7 @@ class ModelCall:
             config = self._pipeline.config
             if config.text is None or not config.text.trained:
                 raise ObservationError(refuse_text(config))
-            raise ObservationError(f"backend {self._backend.name!r} writes no text: take backend 'pytorch'")
+            raise ObservationError(f"backend {self._backend.name!r} writes no text: take {self._backend.instead}")
         ((seen, inputs),) = self.see(observation)
         with self._turn([observation]):
             return self._text.write(seen, inputs, prompt, most)

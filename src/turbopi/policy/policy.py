@@ -19,6 +19,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.checkpoint.quantized_folder import precision_kept
+from turbopi.checkpoint.source import unreported_notes
 from turbopi.config import PolicyConfig, Solver, TimeGrid, memory_of
 from turbopi.models.observation import ModelInputs, Observation, with_cameras
 from turbopi.models.pi0.conditioning import Conditioning
@@ -122,14 +123,14 @@ class UnifiedPolicy:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         known = None if known_cameras is None else KnownCameras.load(known_cameras)
-        precision = precision or precision_kept(checkpoint_dir) or "bf16"
-        self._device = backends.resolve_device(device)
-        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
-        check_backend(name, self._device, precision, checkpoint_dir)  # before a calibration and weights are read
-
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
+        kept = precision_kept(checkpoint)
+        precision = precision or kept or "bf16"
+        self._device = backends.resolve_device(device)
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "chosen")
+        check_backend(name, self._device, precision, checkpoint)  # before a calibration and weights are read
         self.config, model = checkpoint.config, checkpoint.config.model
         flow = num_denoising_steps, solver, time_grid, guidance, guidance_tag
         self._denoising = Denoising.of(self.config, *flow)
@@ -145,7 +146,7 @@ class UnifiedPolicy:
             known_cameras=known,
         )
         self._watch = PolicyWatch()
-        of_weights = [] if checkpoint.format == "random" else checkpoint.source.notes
+        of_weights = [] if checkpoint.format == "random" else unreported_notes(checkpoint.source)
         for note in (*of_weights, *self._pipeline.notes):
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
@@ -159,7 +160,7 @@ class UnifiedPolicy:
         self._calibration = None if calibration is None else f"{calibration.source} ({calibration.identity[:12]})"
         text, writes = self.config.text, self.config.writes_subtasks
         if backend == "auto":  # when all that was given is known to be good
-            backends.qualified(self._device, precision, model, bar=progress, writes=writes)
+            backends.qualified(self._device, precision, model, bar=progress, writes=writes, kept=kept is not None)
             name, why = backends.choose(self._device, precision, model, writes=writes)
         self._guard = Guard(self._device)
         with self._guard:

@@ -31,7 +31,7 @@ class TrainingRange:
     """
 
     def __init__(self, stats: FeatureStats | None, labels: Sequence[Label]) -> None:
-        self.source, low, high = _range_of(stats)
+        self.source, low, high = range_of(stats)
         self.labels = tuple(labels)[: len(low)]
         self.low, self.high = low[: len(self.labels)], high[: len(self.labels)]
         width = np.where(self.high > self.low, self.high - self.low, np.inf)
@@ -84,8 +84,8 @@ class TrainingRange:
         return tuple(self._outside(index, float(values[step, index]), step) for step, index in found)
 
 
-def _range_of(stats: FeatureStats | None) -> tuple[str, np.ndarray, np.ndarray]:
-    """What the range is made of, and its two ends float64[d]."""
+def range_of(stats: FeatureStats | None) -> tuple[str, np.ndarray, np.ndarray]:
+    """What a feature's training range is made of, and its two ends float64[d]; of no dimensions without statistics."""
     if stats is not None and stats.q01 is not None and stats.q99 is not None:
         return "q01 to q99", stats.q01, stats.q99
     if stats is not None and stats.min is not None and stats.max is not None:

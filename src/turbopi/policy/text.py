@@ -19,6 +19,7 @@ from turbopi.models.pi0.sample import Sample
 from turbopi.policy.history import History
 from turbopi.preprocess.pipeline import Incoming, Pipeline
 from turbopi.preprocess.text_prompts import joint_ids, text_ids, text_of
+from turbopi.quantization.plan import EIGHT_BITS
 from turbopi.realtime.messages import MAX_TEXT
 from turbopi.support.errors import ObservationError
 
@@ -84,13 +85,18 @@ class TextCalls:
         if self._config.trained and any(one is None for one in given):
             raise ObservationError(
                 f"backend {self._backend.name!r} writes no subtasks, and this policy acts on them: give `subtask`, or "
-                "take backend 'cuda_graph' or 'pytorch'"
+                f"take backend 'auto'{self._in_bf16}"
             )
         if self._config.subtasks is not None and self._config.subtasks.joint:
             raise ObservationError(
                 f"backend {self._backend.name!r} has no causal prompts, in which this policy reads its subtasks "
-                "(joint_subtask_conditioning): take backend 'cuda_graph' or 'pytorch'"
+                f"(joint_subtask_conditioning): take backend 'auto'{self._in_bf16}"
             )
+
+    @property
+    def _in_bf16(self) -> str:
+        """What else is to be given where no backend that writes has the precision."""
+        return " with precision 'bf16'" * (self._backend.precision in EIGHT_BITS)
 
     def write(self, seen: Incoming, inputs: ModelInputs, prompt: str | None, most: int | None) -> str:
         """What it says to one observation. prompt: in place of the observation's."""

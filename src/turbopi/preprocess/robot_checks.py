@@ -8,6 +8,7 @@ import numpy as np
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.robots.base import Robot, RobotInputs
 from turbopi.support.errors import ActionError, ConfigError, ObservationError, TurboPiError
+from turbopi.support.text import kind_of
 
 
 def read_observation(robot: Robot, observation: Mapping[str, object]) -> RobotInputs:
@@ -25,7 +26,7 @@ def read_observation(robot: Robot, observation: Mapping[str, object]) -> RobotIn
             f"robot {robot.name}: `inputs` failed on this observation: {type(error).__name__}: {error}"
         ) from error
     if not isinstance(given, RobotInputs):
-        raise ObservationError(f"robot {robot.name}: `inputs` gives a {type(given).__name__}, expected RobotInputs")
+        raise ObservationError(f"robot {robot.name}: `inputs` gives {kind_of(given)}, expected RobotInputs")
     return given
 
 

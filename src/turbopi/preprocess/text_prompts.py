@@ -15,6 +15,7 @@ from turbopi.models.family import Pieces
 from turbopi.models.pi0.decoding import EOS
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.support.errors import TokenizerError
+from turbopi.support.text import kind_of
 
 _BYTE = re.compile("<0x[0-9A-F]{2}>")
 _SPECIAL = (0, 1, 2, 3)  # padding, end, beginning and unknown, of PaliGemma's tokenizer
@@ -54,7 +55,7 @@ def text_of(tokenizer: PromptTokenizer, ids: Sequence[int]) -> str:
     encoder: Pieces = tokenizer.encoder  # type: ignore[assignment]  # checked below
     if not hasattr(encoder, "id_to_piece"):
         raise TokenizerError(
-            f"the tokenizer, a {type(encoder).__name__}, has no id_to_piece: text is read with PaliGemma's, as a "
+            f"the tokenizer, {kind_of(encoder)}, has no id_to_piece: text is read with PaliGemma's, as a "
             "SentencePiece model or a tokenizer.json"
         )
     pieces = [encoder.id_to_piece(one) for one in ids if one not in _SPECIAL and one < encoder.vocab_size()]

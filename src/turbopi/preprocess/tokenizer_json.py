@@ -19,6 +19,7 @@ import sentencepiece
 
 from turbopi.support.errors import TokenizerError
 from turbopi.support.reading import MAX_JSON_BYTES, one_line, read_bytes, read_json, shown
+from turbopi.support.text import kind_of
 
 TOKENIZER_JSON, TOKENIZER_CONFIG = "tokenizer.json", "tokenizer_config.json"
 _MAX_BYTES = 64 * 2**20  # PaliGemma's has 17 MB
@@ -197,7 +198,7 @@ def _beside(file: Path) -> Mapping[str, Any]:
     except (ValueError, RecursionError) as error:
         raise TokenizerError(f"{file} isn't JSON: {one_line(error)}") from error
     if not isinstance(said, dict):
-        raise TokenizerError(f"{file} is a {type(said).__name__}; expected an object")
+        raise TokenizerError(f"{file} is {kind_of(said)}; expected an object")
     return said
 
 

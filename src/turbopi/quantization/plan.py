@@ -84,7 +84,7 @@ def reason_for_bf16(site: Site, scale: float | None, kept: str | None, tier: str
     if site.part not in parts:
         return f"{format_of(tier).label} is switched off in the {site.part}"
     if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
-        return "fp8-mlp takes the feed-forward products of vision and prefix alone"
+        return "fp8-mlp takes the feed-forward matmuls of vision and prefix alone"
     if scale is None:
         return "its calibration is older than FP8 for this activation; run `turbopi calibrate` again"
     return refusal(site, format_of(tier)) or kept

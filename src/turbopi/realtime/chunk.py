@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from turbopi.support.errors import ActionError, ConfigError
+from turbopi.support.text import kind_of
 
 _MOST = float(np.finfo(np.float32).max)
 
@@ -31,7 +32,7 @@ def checked_answer(answer: Any, *, model_actions: bool = False, batch: bool = Fa
     answer holds is passed on as it is. Raises ActionError that says what is wrong, NotFinite if it is a number.
     """
     if not isinstance(answer, dict | Mapping):  # a dict is found sooner
-        raise ActionError(f'the policy\'s answer is a {type(answer).__name__}; it should be a dict with "actions"')
+        raise ActionError(f'the policy\'s answer is {kind_of(answer)}; it should be a dict with "actions"')
     for name in ("actions", "model_actions") if model_actions else ("actions",):
         if name not in answer:
             keys = ", ".join(map(str, answer)) or "none"
@@ -107,7 +108,7 @@ def too_far(actions: np.ndarray, last: np.ndarray | None, most: np.ndarray) -> s
     step, dim = beyond[0]
     limit = np.broadcast_to(most, moves.shape[1])[dim]
     where = "from the last command to its first action" if last is not None and step == 0 else "inside it"
-    return f"dimension {dim} moves by {moves[step, dim]:.4g} in one step, {where}; max_jump allows {limit:.4g}"
+    return f"action {dim} moves by {moves[step, dim]:.4g} in one step, {where}; max_jump allows {limit:.4g}"
 
 
 def mix(new: np.ndarray, old: np.ndarray, old_weight: float) -> None:

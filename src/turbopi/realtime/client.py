@@ -28,6 +28,7 @@ from turbopi.realtime.running_chunk import RunningChunk
 from turbopi.realtime.shared_memory import Parts
 from turbopi.realtime.wire import Unpacker, WireError, pack, pack_parts
 from turbopi.support.errors import ActionError, ConfigError, DeviceLost, ObservationError, TurboPiError
+from turbopi.support.text import kind_of
 
 logger = logging.getLogger(__name__)
 _REFUSALS: dict[str, type[TurboPiError]] = {
@@ -101,9 +102,7 @@ class RealTimeClient:
         ServerRefused for other answers, and ServerLost.
         """
         if previous is not None and not isinstance(previous, RunningChunk):
-            raise ObservationError(
-                f"previous is a {type(previous).__name__}; it should be a turbopi.realtime.RunningChunk"
-            )
+            raise ObservationError(f"previous is {kind_of(previous)}; it should be a turbopi.realtime.RunningChunk")
         mode = None if previous is None else previous.mode
         asks = previous is not None or model_actions or seed is not None
         check = partial(self._check_offered, mode) if asks else None
@@ -275,7 +274,7 @@ class RealTimeClient:
                 raise WireError("a text frame where a message should be")
             unpacked = self._unpacker.unpack(data)
             if not isinstance(unpacked, dict):
-                raise WireError(f"a {type(unpacked).__name__} where a map should be")
+                raise WireError(f"{kind_of(unpacked)} where a map should be")
         except WireError as error:
             raise ServerRefused(f"the server at {self.url} doesn't speak openpi's protocol: {error}") from error
         return unpacked

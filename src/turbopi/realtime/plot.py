@@ -43,7 +43,7 @@ def plot_run(file: Path, journal: Journal, report: dict[str, Any]) -> None:
             ax.axvspan(step - 0.5, step + 0.5, color=_EMPTY, alpha=0.25, linewidth=0)
         for step in borders:
             ax.axvline(step, color=_BORDER, linewidth=0.7, linestyle=":")
-        ax.set_ylabel(f"dim {dim}", fontsize=8)
+        ax.set_ylabel(f"action {dim}", fontsize=8)
         ax.tick_params(labelsize=7)
     _draw_delays(axes[-1], journal.inferred, steps, report)
     more = f", the first {dims} of {width} dimensions" if width > dims else ""

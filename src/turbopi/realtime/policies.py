@@ -7,6 +7,7 @@ from typing import Any
 
 from turbopi.realtime import Way
 from turbopi.support.errors import ConfigError
+from turbopi.support.text import kind_of
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +26,7 @@ def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
     Warns, in the log, of a policy with memory, whose history the executor doesn't keep.
     """
     if not callable(getattr(policy, "infer", None)):
-        raise ConfigError(f"a {type(policy).__name__} is no policy: it has no infer(observation)")
+        raise ConfigError(f"{kind_of(policy)} is no policy: it has no infer(observation)")
     metadata = metadata_of(policy)
     if "memory" in metadata:
         logger.warning(

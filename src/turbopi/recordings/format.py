@@ -33,6 +33,7 @@ from turbopi.support.errors import ObservationError
 from turbopi.support.files import write_whole
 from turbopi.support.reading import Npz, is_finite, listing, parse_json, shown
 from turbopi.support.reading.arrays import is_unicode
+from turbopi.support.text import kind_of
 
 FORMAT = "turbopi-recording"
 VERSION, WITH_IMAGES = 1, 2
@@ -129,7 +130,7 @@ def _to_node(
             return {kind: member}
         members[member] = array
         return {"array" if isinstance(value, np.ndarray) else "scalar": member}
-    raise ObservationError(f"can't record {name}: it is a {type(value).__name__}")
+    raise ObservationError(f"can't record {name}: it is {kind_of(value)}")
 
 
 def _image_kind(array: np.ndarray) -> str | None:

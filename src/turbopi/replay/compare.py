@@ -12,7 +12,7 @@ import numpy as np
 
 from turbopi.replay.document import Against, Changed, Control, Joint, PolicyDocument, Spread, State
 from turbopi.replay.episodes import Episode
-from turbopi.replay.run import Replayed, reach_of
+from turbopi.replay.run import Replayed
 from turbopi.support.action_groups import action_groups
 
 NEVER_MOVED = 2e-6  # of a unit: the epsilons of normalising, where the statistics have one value alone
@@ -130,7 +130,7 @@ def policy_document(one: Compared, checkpoint: str, action_names: Sequence[str] 
     horizon = int(np.isfinite(run.recorded).any(axis=(0, 2)).sum())  # indices that something was recorded of
     predicted, recorded = run.moved
     joints = []
-    low, high = run.middle.mean(0) - run.reach * run.units, run.middle.mean(0) + run.reach * run.units
+    low, high = run.ends.mean(1)
     for index, (name, unit) in enumerate(names_of(one, action_names)):
         values = run.recorded[..., index]
         joints.append(
@@ -177,10 +177,10 @@ def quantiles(values: np.ndarray) -> tuple[float, float]:
 def state_documents(run: Replayed, names: Sequence[str] | None) -> list[State]:
     """Each number of the state beside its statistics."""
     found = []
-    ranges = state_ranges(run)
+    ranges = [(float(low), float(high)) for low, high in zip(*run.state_range, strict=True)]
     width = run.states.shape[1]
     for index in range(width):
-        name = names[index] if names is not None and len(names) == width else f"state {index}"
+        name = names[index] if names is not None and len(names) == width else f"value {index}"
         recorded = quantiles(run.states[:, index])
         trained = ranges[index] if index < len(ranges) else None
         outside = False
@@ -189,16 +189,6 @@ def state_documents(run: Replayed, names: Sequence[str] | None) -> list[State]:
             outside = half > NEVER_MOVED and max(abs(recorded[0] - middle), abs(recorded[1] - middle)) > OUTSIDE * half
         found.append(State(name, recorded, trained, outside))
     return found
-
-
-def state_ranges(run: Replayed) -> list[tuple[float, float]]:
-    """What nearly all of the training's states were within; empty without statistics."""
-    scale, width = run.state_scale, run.states.shape[1]
-    if scale.width is None:
-        return []
-    reach = reach_of(scale)
-    low, high = (scale.unnormalize(np.full(scale.width, at))[:width] for at in (-reach, reach))
-    return [(float(a), float(b)) for a, b in zip(low, high, strict=True)]
 
 
 # --- two policies -----------------------------------------------------------------------------------------------------

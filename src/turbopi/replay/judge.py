@@ -6,7 +6,7 @@ import numpy as np
 
 from turbopi.replay.compare import HELD, MEAN, NEVER_MOVED, OTHERS, Compared
 from turbopi.replay.document import Changed, Control, Level, PolicyDocument, State, Verdict
-from turbopi.replay.run import broken_text, reach_of
+from turbopi.replay.run import broken_text
 from turbopi.support.text import significant
 
 FOLLOWS, PARTLY = 0.5, 0.8  # of the error of a chunk that knows nothing of the moment
@@ -75,14 +75,13 @@ def _of_units(one: Compared, states: Sequence[State], wrong: bool) -> Iterator[s
     radians for degrees, as a robot that hardly moves has such numbers, too.
     """
     run = one.run
-    scale = run.state_scale
-    if scale.width is not None:
-        reach, width = reach_of(scale), run.states.shape[1]
-        low, high = (scale.unnormalize(np.full(scale.width, at))[:width] for at in (-reach, reach))
+    low, high = run.state_range
+    if len(low):
+        numbers = run.states[:, : len(low)]
         moving, middle = (high - low) / 2 > NEVER_MOVED, (high + low) / 2
         half = np.where(moving, (high - low) / 2, 1)
         outside = [state for state in states if state.outside]
-        found = _converted(lambda factor: (factor * run.states - middle) / half, moving, wrong)
+        found = _converted(lambda factor: (factor * numbers - middle) / half, moving, wrong)
         if found is not None:
             yield (
                 f"The states look as if they were in {found}. Convert them where they are recorded, or in a robot of "
@@ -96,9 +95,9 @@ def _of_units(one: Compared, states: Sequence[State], wrong: bool) -> Iterator[s
                 "this its robot?"
             )
     recorded = run.recorded.reshape(-1, run.recorded.shape[2])
-    middle = np.repeat(run.middle, run.recorded.shape[1], 0)
-    moving = run.units > NEVER_MOVED
-    half = np.where(moving, run.reach * run.units, 1)
+    low, high = np.repeat(run.ends, run.recorded.shape[1], 1)
+    middle, moving = (high + low) / 2, ((high - low) / 2 > NEVER_MOVED).all(0)
+    half = np.where(moving, (high - low) / 2, 1)
     found = _converted(lambda factor: (factor * recorded - middle) / half, moving, wrong)
     if found is not None:
         yield f"The recorded actions look as if they were in {found}."

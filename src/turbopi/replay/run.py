@@ -12,9 +12,10 @@ import numpy as np
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.policy.history import refuse_memory
 from turbopi.policy.policy import UnifiedPolicy
+from turbopi.policy.ranges import range_of
 from turbopi.policy.readings import Checks
 from turbopi.policy.watch import Sample
-from turbopi.preprocess.normalize import Normalizer
+from turbopi.preprocess.normalize import pad_last
 from turbopi.replay.document import Broken
 from turbopi.replay.episodes import Dataset, Episode, Moment, Selection
 from turbopi.replay.keys import KeyMap, join_keys
@@ -48,9 +49,9 @@ class Replayed:
     previous     float64[N, d]     the action before; NaN where there is none
     units        float64[d]        how far each action moves with one unit of the model's normalised actions
     middle       float64[N, d]     the action that a normalised 0 is, which depends on the state for relative actions
+    ends         float64[2, N, d]  the training range's (policy/ranges.py), which for those depend on it, too
     states       float64[N, s]     as the model reads them, before normalisation
-    state_scale  what normalises those
-    reach        how many units beside the middle hold nearly all of the training's actions
+    state_range  (low, high)       float64[≤ s], the training's; of no numbers without statistics
     call_ms      of each call of the policy, a batch's counted once
     variations   {name: float64[n, H, d]}, the chunks of `changed`, indices of moments
     cameras      a few pixels of every moment's images, by the robot's own key
@@ -65,9 +66,9 @@ class Replayed:
     previous: np.ndarray
     units: np.ndarray
     middle: np.ndarray
+    ends: np.ndarray
     states: np.ndarray
-    state_scale: Normalizer
-    reach: float
+    state_range: tuple[np.ndarray, np.ndarray]
     call_ms: Sequence[float]
     changed: Sequence[int]
     variations: Mapping[str, np.ndarray]
@@ -81,6 +82,7 @@ class Replayed:
         return replace(
             self,
             **arrays,
+            ends=self.ends[:, rows],
             moments=[self.moments[row] for row in rows],
             changed=[rows.index(self.changed[number]) for number in kept],
             variations={name: chunks[kept] for name, chunks in self.variations.items() if kept},
@@ -94,9 +96,13 @@ class Replayed:
         return self.predicted - self.middle[:, None], self.recorded - self.middle[:, None]
 
 
-def reach_of(scale: Normalizer) -> float:
-    """1 where the statistics are a range; by z-score the normal distribution's 1 % and 99 % quantiles."""
-    return 2.326 if scale.mode.endswith("zscore") else 1.0
+def ends_of(policy: UnifiedPolicy) -> np.ndarray:
+    """float32[2, action_dim], the training range's ends as the model has them; ±1 without statistics."""
+    scale, width = policy.pipeline.action_scale, policy.config.model.action_dim
+    _, *ends = range_of(policy._checkpoint.norm_stats.actions)
+    if not len(ends[0]):
+        return np.repeat(np.array([[-1], [1]], np.float32), width, 1)
+    return np.stack([pad_last(scale.normalize(end), width)[:width] for end in ends]).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,7 @@ class Replay:
         self.policy, self.dataset, self.settings = policy, dataset, settings
         self.horizon = policy.config.model.action_horizon
         self._checks = Checks(policy.pipeline, NormStats())  # for its readings of the images
+        self._ends = ends_of(policy)
         dataset.wanted = None
         self._first = self._read_first(episodes[0])
         self.keys = join_keys(policy, self._first.observation, settings.renames, settings.task)
@@ -255,6 +262,7 @@ class Replay:
                 f"{self.dataset.path}: none of the policy's {len(broken)} answers is a chunk that a robot may be "
                 f"given. The first: {broken_text(broken[0])}"
             )
+        _, low, high = range_of(self.policy._checkpoint.norm_stats.state)
         return Replayed(
             self.policy.metadata,
             self.keys,
@@ -264,9 +272,9 @@ class Replay:
             np.stack([one.previous for one in found]),
             action_units(self.policy, self._observation(self._first))[: self.width],
             np.stack([one.middle for one in found]),
-            np.stack([one.state for one in found]),
-            self.policy.pipeline.state_scale,
-            reach_of(self.policy.pipeline.action_scale),
+            np.stack([one.ends for one in found], axis=1),
+            states := np.stack([one.state for one in found]),
+            (low[: states.shape[1]], high[: states.shape[1]]),
             call_ms,
             changed,
             {name: np.stack(chunks) for name, chunks in varied.items() if chunks},
@@ -322,14 +330,17 @@ class Replay:
         one = pipeline.see(observation, resize=False)
         reading = self._checks.reading(one)
         pipeline.read(one)
-        zeros = np.zeros((model.action_horizon, model.action_dim), np.float32)
-        middle = pipeline.after(zeros, one.state)["actions"][0, : self.width]
+        constant = np.zeros((3, model.action_horizon, model.action_dim), np.float32)
+        constant[1:] = self._ends[:, None]
+        made = pipeline.after_all(constant, [one.state] * 3)
+        middle, *ends = (chunk["actions"][0, : self.width] for chunk in made)
         return _Answer(
             (moment.episode, moment.step),
             self._padded(moment.recorded),
             self._before(moment),
             chunk,
             middle,
+            np.sort(ends, axis=0),  # some joints turn the other way
             np.array(one.robot.state, np.float64),
             {} if reading is None else {name: Sample(each.shape, each.pixels) for name, each in reading.images.items()},
         )
@@ -354,6 +365,7 @@ class _Answer:
     previous: np.ndarray
     chunk: np.ndarray
     middle: np.ndarray
+    ends: np.ndarray
     state: np.ndarray
     images: Mapping[str, Sample]
 

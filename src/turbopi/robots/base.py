@@ -15,6 +15,7 @@ import numpy as np
 
 from turbopi.config import CAMERAS
 from turbopi.support.errors import ObservationError
+from turbopi.support.text import kind_of
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def names_in(observation: Mapping[str, object], folder: str) -> list[str]:
     """The names directly below `folder`, nested or flat: ["cam_high"] for either form of "images/cam_high"."""
     nested = observation.get(folder, {})
     if not isinstance(nested, Mapping):
-        raise ObservationError(f"{folder!r} is a {type(nested).__name__}, expected a dict of images by camera")
+        raise ObservationError(f"{folder!r} is {kind_of(nested)}, expected a dict of images by camera")
     prefix = folder + "/"
     flat = [str(key)[len(prefix) :] for key in observation if str(key).startswith(prefix)]
     return [*map(str, nested), *flat]
@@ -209,7 +210,7 @@ def read_prompt(value: object, key: str = "prompt") -> str:
         return str(value)
     if value is None:
         raise ObservationError(f"{key} is None; leave the key out to use the default prompt")
-    raise ObservationError(f"{key} is a {type(value).__name__}, expected text")
+    raise ObservationError(f"{key} is {kind_of(value)}, expected text")
 
 
 def optional_prompt(observation: Mapping[str, object], key: str = "prompt") -> str | None:

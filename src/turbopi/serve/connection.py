@@ -275,7 +275,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._process(data)
 
     def _process(self, data: bytes | memoryview) -> None:
-        if self.protocol.state is State.CLOSING:
+        if self.protocol.close_expected():
             self._hand_over(data)  # which throws it away
             self._pause_reading_briefly()
         else:
@@ -304,6 +304,10 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             super().send_data()
         if self.protocol.close_expected():
             self._once("close", self._limits.close_seconds, self.transport.abort)
+            if self._backlog and self.protocol.state is State.CONNECTING:
+                # Refused. A socket that isn't read to its end may lose the refusal, and doesn't see its client leave.
+                self._backlog = b""
+                self._set_reading(True)
 
     def connection_lost(self, exc: Exception | None) -> None:
         with self._writing:  # asyncio closes the socket after this

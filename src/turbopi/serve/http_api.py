@@ -69,6 +69,7 @@ _POST = b"POST "
 _NO_REQUEST = (
     f"no request that this server reads: it answers GET of HTTP/1.1 without a body, websockets, and POST {ACTIONS}\n"
 ).encode()
+_SHUT = "the client's side of the connection was closed before the answer: keep it open until that has come"
 _CONTROL = re.compile(rb"[\x00-\x08\x0a-\x1f\x7f]")
 _OWN_HEADERS = (b"connection", b"upgrade", b"expect", b"te", b"trailer", b"keep-alive", b"proxy-connection")
 _reader = ThreadPoolExecutor(1, thread_name_prefix="turbopi-json")  # one body at a time, beside the event loops
@@ -212,6 +213,13 @@ class Post(asyncio.Protocol):
             return
         self._http.receive_data(data)
         self._advance()
+
+    def eof_received(self) -> None:
+        """The client sends no more: it has left, as far as anybody can tell, so its request ends, with a word to one
+        that only shut its sending side.
+        """
+        if not self._ended:
+            self._error(HTTPStatus.BAD_REQUEST, "malformed", f"bad request: {_SHUT}")
 
     def pause_writing(self) -> None:
         self._connection.pause_writing()

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from turbopi.support.errors import ConfigError, TurboPiError
+from turbopi.support.text import kind_of
 
 Seeding = Literal["episode", "task"]
 
@@ -132,7 +133,7 @@ def observation_problem(observation: Any, image_keys: Sequence[str]) -> str | No
     image_keys   where its images are, uint8[h, w, 3]
     """
     if not isinstance(observation, dict):
-        return f"the observation is a {type(observation).__name__}; it should be a dict of keys and values"
+        return f"the observation is {kind_of(observation)}; it should be a dict of keys and values"
     for key in image_keys:
         if key not in observation:
             return f"the observation has no {key!r}; it has {', '.join(map(str, observation)) or 'nothing'}"

@@ -62,7 +62,7 @@ def action_groups(robot: str, dims: int, names: Sequence[str] | None = None) -> 
         ActionGroup(
             f"actions {eight[0]} to {eight[-1]}",
             "the robot's units",
-            {index: names[index] if names is not None and len(names) == dims else f"dim {index}" for index in eight},
+            {index: names[index] if names is not None and len(names) == dims else f"action {index}" for index in eight},
         )
         for eight in eights
     ]

@@ -33,6 +33,12 @@ def counted(number: int, what: str) -> str:
     return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
 
 
+def kind_of(value: object) -> str:
+    """The name of a value's type with its article, for sentences: "an int", "a list", "None"."""
+    name = type(value).__name__
+    return "None" if value is None else f"{'an' if name[0] in 'aeioAEIO' or name == 'ndarray' else 'a'} {name}"
+
+
 def did_you_mean(typed: str, known: Iterable[str]) -> str:
     """A question with the known names that were probably meant: "did you mean a or b?"; "" if there are none.
 

@@ -26,9 +26,10 @@ from turbopi.models import family_of
 from turbopi.models.pi0 import exact
 from turbopi.policy import shipped
 from turbopi.policy.examples import NoisyExample
+from turbopi.policy.kept_precision import check_backend
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.support.errors import BackendError, BackendUnavailable, CheckpointError
+from turbopi.support.errors import BackendError, CheckpointError
 from turbopi.support.provenance import provenance
 from turbopi.verify import control
 from turbopi.verify.document import Certificate, Latencies, Latency, ObservationsDocument, WeightsDocument
@@ -56,9 +57,7 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
     name = arguments["backend"]
     if name == "auto":
         name, _ = backends.choose(device, precision, checkpoint.config.model)
-    backends.check(name, device, precision)
-    if (why := backends.refusal(name, device, precision, checkpoint.config.model)) is not None:
-        raise BackendUnavailable(why)  # before minutes of the reference
+    check_backend(name, device, precision, checkpoint)  # before minutes of the reference
     rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)
     quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)

@@ -282,7 +282,7 @@ def _actions(robot: str, compared: Compared, control: Compared) -> ActionsDocume
     call, errors = compared.worst
     groups = action_groups(robot, len(compared.by_dimension))
     labels = {
-        index: (name if name == group.title or name.startswith("dim ") else f"{group.title} {name}", group.unit)
+        index: (name if name == group.title or name.startswith("action ") else f"{group.title} {name}", group.unit)
         for group in groups
         for index, name in group.names.items()
     }

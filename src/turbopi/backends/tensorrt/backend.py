@@ -74,6 +74,7 @@ class TensorRTBackend(Backend):
     name: ClassVar[str] = "tensorrt"
     precisions: ClassVar[tuple[FloatPrecision, ...]] = ("bf16",)
     any_horizon: ClassVar[bool] = False  # engines are built for one
+    instead: ClassVar[str] = "backend 'fused', 'cuda_graph' or 'pytorch'"
 
     def load_weights(self, load: LoadState) -> None:
         if (heads := self.config.vlm.num_kv_heads) != 1:
@@ -96,7 +97,7 @@ class TensorRTBackend(Backend):
         if reason is not None:
             return reason
         if device.type != "cuda":
-            return "TensorRT's engines run on NVIDIA GPUs; use backend 'pytorch' or 'onnx'"
+            return "TensorRT's engines run on NVIDIA GPUs; use backend 'pytorch'"
         major, minor = torch.cuda.get_device_capability(device)
         if major < 8:
             return f"it needs compute capability 8.0 or newer for bfloat16, this GPU has {major}.{minor}"

@@ -23,7 +23,7 @@ class TensorRTFp8Backend(TensorRTBackend):
         reason = super().unavailable(device)
         if reason is None and (capability := torch.cuda.get_device_capability(device)) < (8, 9):
             major, minor = capability
-            return f"E4M3 products need compute capability 8.9 or newer, this GPU has {major}.{minor}; use 'tensorrt'"
+            return f"E4M3 matmuls need compute capability 8.9 or newer, this GPU has {major}.{minor}; use 'tensorrt'"
         return reason
 
     def describe(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from turbopi.models.family import AnswerReader, Pieces
 from turbopi.models.pi0.decoding import EOS
 from turbopi.models.pi0_fast.action_tokens import BEGINNING, END, FastTokenizer, codes_of, owners_actions
 from turbopi.support.errors import ActionError, TokenizerError
+from turbopi.support.text import kind_of
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def reader(config: Pi0FastConfig, pieces: Pieces, folder: Path | None) -> Answer
     lacking = [name for name in ("id_to_piece", "encode", "decode", "vocab_size") if not hasattr(pieces, name)]
     if lacking:
         raise TokenizerError(
-            f"the tokenizer, a {type(pieces).__name__}, has no {', '.join(lacking)}: answers are read with "
+            f"the tokenizer, {kind_of(pieces)}, has no {', '.join(lacking)}: answers are read with "
             "PaliGemma's, as a SentencePiece model or a tokenizer.json"
         )
     end = pieces.encode(END)

@@ -8,6 +8,7 @@ from typing import Any
 
 from turbopi.support.errors import CheckpointError
 from turbopi.support.reading.files import Error, read_bytes, shown
+from turbopi.support.text import kind_of
 
 MAX_JSON_BYTES = 16 * 2**20  # of a description; files of data (results, calibrations) are given more
 MAX_JSON_DEPTH = 64
@@ -35,7 +36,7 @@ def read_json(
     """
     value = parse_json(read_bytes(file, error, limit=limit, hint=hint), file, error, depth=depth, nan=nan)
     if not isinstance(value, dict):
-        raise error(f"{file} is a {type(value).__name__}; expected an object")
+        raise error(f"{file} is {kind_of(value)}; expected an object")
     return value
 
 
