@@ -67,9 +67,17 @@ def _product_fp8(tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp
     return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True), ARCH, sizes, folder=folder)
 
 
-def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, *, packed: bool = False) -> bytes:
-    sizes = attention.constants(tile, False, whole, packed)
-    return nvrtc.compile_cubin(attention.source(tile), ARCH, sizes, folder=folder)
+def _product_int8(tile: Tile, epilogue: Epilogue, folder: Path | None) -> bytes:
+    takes = bf16.parameters(fp8=True, residual=False, normed=False, copied=False, marks=True)
+    sizes = fp8.constants(tile, epilogue, True, 0, whole=True, marks=True)
+    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True, whole=True), ARCH, sizes, folder=folder)
+
+
+def _attention(
+    tile: attention.AttentionTile, whole: bool, folder: Path | None, *, packed: bool = False, in_int8: bool = False
+) -> bytes:
+    sizes = attention.constants(tile, in_int8, whole, packed, in_int8)
+    return nvrtc.compile_cubin(attention.source(tile, in_int8), ARCH, sizes, folder=folder)
 
 
 def _layer_norm(has_y: bool, in_fp8: bool, folder: Path | None) -> bytes:
@@ -102,6 +110,8 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     ),
     "prefix's GeGLU, bf16": partial(_product, Tile(3, 128, 1, 2, overlap=True), "geglu", False),
     "prefix's GeGLU, fp8": partial(_product_fp8, Tile(3, 128, cluster_n=2, overlap=True), "geglu", 2048, 0, True),
+    "prefix's GeGLU, int8": partial(_product_int8, Tile(2, 256, cluster_n=2), "geglu"),
+    "prefix's attention, int8": partial(_attention, attention.AttentionTile(256, 64), False, in_int8=True),
     "vision's qkv in batches, bf16": partial(_product, Tile(2, 176, 2, overlap=True), "bias", False),
     "vision's fc1 in batches, fp8": partial(_product_fp8, Tile(2, 184, overlap=True), "gelu", 1152, 0, True),
     "vision's output added to the stream in batches, fp8": partial(_product_fp8, Tile(3, 192), "added", 1152, 0, False),
