@@ -60,7 +60,7 @@ struct Product {
       for (int piece = 0; piece < PIECES; ++piece) {
         a[group][piece] = make_uint4(0, 0, 0, 0);
         if (there && token < T && (S::RANGES == 1 || token < from() + S::RANGE))
-          a[group][piece] = load_shared_by_grid(activation + ((at * T + token) * PIECES + piece) * 64 + lane % 4 * 16);
+          a[group][piece] = load_shared_by_grid(activation + ((at * PIECES + piece) * T + token) * 64 + lane % 4 * 16);
       }
     }
   }
