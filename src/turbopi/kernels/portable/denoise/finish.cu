@@ -71,6 +71,13 @@ struct Normed {
     if (SCALED && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
     return f;
   }
+  // Those of the block's tiles, to L2
+  __device__ __forceinline__ void ahead(int first, int end) const {
+    const int tile = first + threadIdx.x;
+    if (tile >= end) return;
+    if (MODULATED) to_l2(shifted + tile * 8);
+    if (SCALED) to_l2(scales + tile * 8);
+  }
   __device__ __forceinline__ float2 apply(Item i, Factors f, float2 sum) const {
     const float by = inverse_rms[i.token];
     return make_float2(sum.x * (by * f.scale.x) + f.shift.x, sum.y * (by * f.scale.y) + f.shift.y);

@@ -125,9 +125,14 @@ struct Product {
               half % 2 ? make_float2(of[2], of[3]) : make_float2(of[0], of[1]);
         }
       __syncthreads();
+      constexpr int ITEMS = S::PASS_TILES * S::RANGE * 4;
+      Item next = mine;  // whose factors are on their way while an item is finished
+      auto next_factors = factors;
+      if (pass > 0) next = item(pass, thread), next_factors = finish.factors(next);
 #pragma unroll 1
-      for (int index = thread; index - lane < S::PASS_TILES * S::RANGE * 4; index += THREADS) {
-        if (pass > 0 || index >= THREADS) mine = item(pass, index), factors = finish.factors(mine);
+      for (int index = thread; index - lane < ITEMS; index += THREADS) {
+        mine = next, factors = next_factors;
+        if (ITEMS > THREADS) next = item(pass, index + THREADS), next_factors = finish.factors(next);
         float2 sum = make_float2(0, 0);
         if (mine.valid) {
           const int row = (mine.tile - first - pass * S::PASS_TILES) * S::SUM_ROWS + mine.token - from();
