@@ -2,21 +2,31 @@
 
 __device__ __forceinline__ float2 two(const float* from) { return __ldg((const float2*)from); }
 
-// 1 / rms of all tokens, from the sums of squares of all tiles.
+// 1 / rms of all tokens, from the sums of squares of all tiles. A warp has every WARPS-th token; all are on their way at
+// once.
 __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) {
   const int thread = thread_of_phase(), warp = thread / 32, lane = thread % 32;
+  constexpr int OWN = (T + WARPS - 1) / WARPS, LOADS = (D_TILES + 31) / 32;
+  float of[OWN][LOADS], sums[OWN] = {}, mine = 0;
 #pragma unroll
-  for (int first = 0; first < T; first += WARPS) {
-    const int token = first + warp;
-    float sum = 0;
-    if (token < T)
+  for (int i = 0; i < OWN; ++i)
 #pragma unroll
-      for (int tile = 0; tile < D_TILES; tile += 32)
-        if (tile + lane < D_TILES) sum += __ldcg(args.squares + token * D_TILES + tile + lane);
+    for (int n = 0; n < LOADS; ++n) {
+      const bool there = (i * WARPS + WARPS <= T || i * WARPS + warp < T) && (n * 32 + 32 <= D_TILES || n * 32 + lane < D_TILES);
+      of[i][n] = there ? __ldcg(args.squares + (i * WARPS + warp) * D_TILES + n * 32 + lane) : 0;
+    }
 #pragma unroll
-    for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
-    if (token < T && lane == 0) smem[S_RMS + token] = rsqrtf(sum / D + args.eps);
-  }
+  for (int i = 0; i < OWN; ++i)
+#pragma unroll
+    for (int n = 0; n < LOADS; ++n) sums[i] += of[i][n];
+#pragma unroll
+  for (int by = 16; by; by /= 2)
+#pragma unroll
+    for (int i = 0; i < OWN; ++i) sums[i] += __shfl_xor_sync(~0u, sums[i], by);
+#pragma unroll
+  for (int i = 0; i < OWN; ++i)
+    if (lane == i) mine = sums[i];
+  if (lane < OWN && lane * WARPS + warp < T) smem[S_RMS + lane * WARPS + warp] = rsqrtf(mine / D + args.eps);
 }
 
 // The same in front of a product. Of a narrow stream some threads have a token of the block's range: their loads go in front
