@@ -2,23 +2,19 @@
 
 __device__ __forceinline__ float2 two(const float* from) { return __ldg((const float2*)from); }
 
-// 1 / rms of all tokens, from the sums of squares of all tiles. A warp has every WARPS-th token; all are on their way at
-// once.
+// 1 / rms of all tokens, from the sums of squares of all tiles. A warp has every WARPS-th token, all on their way at once.
 __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) {
   const int thread = thread_of_phase(), warp = thread / 32, lane = thread % 32;
-  constexpr int OWN = (T + WARPS - 1) / WARPS, LOADS = (D_TILES + 31) / 32;
-  float of[OWN][LOADS], sums[OWN] = {}, mine = 0;
+  constexpr int OWN = (T + WARPS - 1) / WARPS;
+  float sums[OWN] = {}, mine = 0;
 #pragma unroll
-  for (int i = 0; i < OWN; ++i)
+  for (int i = 0; i < OWN; ++i) {
+    const int token = i * WARPS + warp;
+    if (i * WARPS + WARPS <= T || token < T)
 #pragma unroll
-    for (int n = 0; n < LOADS; ++n) {
-      const bool there = (i * WARPS + WARPS <= T || i * WARPS + warp < T) && (n * 32 + 32 <= D_TILES || n * 32 + lane < D_TILES);
-      of[i][n] = there ? __ldcg(args.squares + (i * WARPS + warp) * D_TILES + n * 32 + lane) : 0;
-    }
-#pragma unroll
-  for (int i = 0; i < OWN; ++i)
-#pragma unroll
-    for (int n = 0; n < LOADS; ++n) sums[i] += of[i][n];
+      for (int tile = 0; tile < D_TILES; tile += 32)
+        if (tile + lane < D_TILES) sums[i] += __ldcg(args.squares + token * D_TILES + tile + lane);
+  }
 #pragma unroll
   for (int by = 16; by; by /= 2)
 #pragma unroll
