@@ -126,13 +126,18 @@ struct Product {
         }
       __syncthreads();
       constexpr int ITEMS = S::PASS_TILES * S::RANGE * 4;
-      Item next = mine;  // whose factors are on their way while an item is finished
+      constexpr bool ASKS_AHEAD = MODULATED && ITEMS > THREADS;  // for the next item's factors
+      Item next = mine;
       auto next_factors = factors;
-      if (pass > 0) next = item(pass, thread), next_factors = finish.factors(next);
+      if (ASKS_AHEAD && pass > 0) next = item(pass, thread), next_factors = finish.factors(next);
 #pragma unroll 1
       for (int index = thread; index - lane < ITEMS; index += THREADS) {
-        mine = next, factors = next_factors;
-        if (ITEMS > THREADS) next = item(pass, index + THREADS), next_factors = finish.factors(next);
+        if (ASKS_AHEAD) {
+          mine = next, factors = next_factors;
+          next = item(pass, index + THREADS), next_factors = finish.factors(next);
+        } else if (pass > 0 || index >= THREADS) {
+          mine = item(pass, index), factors = finish.factors(mine);
+        }
         float2 sum = make_float2(0, 0);
         if (mine.valid) {
           const int row = (mine.tile - first - pass * S::PASS_TILES) * S::SUM_ROWS + mine.token - from();
