@@ -109,7 +109,7 @@ ARGS = Struct(
         *OF_LAUNCH,
         Parameter("float*", "x", "[T][D] the residual stream"),
         Parameter("float*", "squares", "[T][D/8] of x, added up by tiles"),
-        Parameter("unsigned char*", "stream", "[chunk][T][columns of a chunk] x times a norm's scale; zeros beyond D"),
+        Parameter("unsigned char*", "stream", "[piece][T][columns of a piece] x times a norm's scale; zeros beyond D"),
         Parameter("unsigned char*", "attended", "the same of attention's outputs"),
         Parameter("unsigned char*", "hidden", "the same of the feed-forward's hidden units"),
         Parameter("unsigned char*", "queries", "bf16 [T * n][K]"),
