@@ -126,10 +126,10 @@ struct Product {
         }
       __syncthreads();
       constexpr int ITEMS = S::PASS_TILES * S::RANGE * 4;
-      constexpr bool ASKS_AHEAD = MODULATED && ITEMS > THREADS;  // for the next item's factors
+      // For the next item's factors, where registers aren't short
+      constexpr bool ASKS_AHEAD = MODULATED && S::PASSES == 1 && ITEMS > THREADS;
       Item next = mine;
       auto next_factors = factors;
-      if (ASKS_AHEAD && pass > 0) next = item(pass, thread), next_factors = finish.factors(next);
 #pragma unroll 1
       for (int index = thread; index - lane < ITEMS; index += THREADS) {
         if (ASKS_AHEAD) {
