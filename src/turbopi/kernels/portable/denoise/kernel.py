@@ -69,7 +69,7 @@ NARROW = Choices(warps=16, sums=8, weights=8, activations=7, ahead=True)  # of S
 IN_RANGES = Choices(
     warps=16, sums=4, weights=12, activations=8, ahead=True, ranges=2, wide_ranges=4, across_at_once=True
 )
-MANY_IN_RANGES = replace(MANY, ranges=2)
+MANY_IN_RANGES = replace(FEW, ranges=2, wide_ranges=2)
 MANY_BLOCKS = 132
 
 
