@@ -183,6 +183,19 @@ def test_choices_of_a_launch_change_no_more_than_the_order_of_sums(
     assert relative(run(p, packed, monkeypatch, folder, blocks=3, choice=choice)[0], usual) < 3e-3
 
 
+def test_a_block_with_half_of_the_tokens_adds_up_in_the_same_order(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    p = problem("golden", 1, 50, 77, 1, CPU)
+    packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=INT8)
+    whole, half = (
+        run(p, packed, monkeypatch, folder, blocks=13, choice=choice)
+        for choice in (denoise.MANY, denoise.MANY_IN_RANGES)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(whole, half, strict=True))
+    assert denoise.choices(50, blocks=denoise.MANY_BLOCKS) == denoise.MANY_IN_RANGES
+
+
 @pytest.mark.parametrize(
     ("name", "steps", "suffix", "length", "blocks"),
     [("golden", 2, 1, 5, 1), ("golden", 2, 10, 37, 3), ("odd", 1, 17, 70, 2), ("uneven", 1, 10, 30, 3)],

@@ -39,6 +39,7 @@ INSTRUCTIONS = (
     *(("cluster.arrive", "cluster_exchange"), ("cluster.wait", "cluster_wait")),
     *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
+    ("lop3.b32 %0, %1, %2, %3, 0xEA", "and_or"),
     *(("fma.rn.bf16x2", "fma_bf16x2"), ("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
     *(("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2"), ("m8n8.x4.shared.b16", "ldmatrix")),
     *(("m16n8k16.row.col.f32.bf16", "mma_bf16"), ("m16n8k16.row.col.f32.f16", "mma_half")),

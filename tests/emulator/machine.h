@@ -474,6 +474,7 @@ inline void ptx_wgmma_wait(int left) { machine::await(left); }
 inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {
     both = machine::to_bf16(high) << 16 | machine::to_bf16(low);
 }
+inline void ptx_and_or(unsigned& y, unsigned a, unsigned b, unsigned c) { y = (a & b) | c; }
 inline void ptx_fma_bf16x2(unsigned& both, unsigned a, unsigned b, unsigned c) {
     auto one = [&](int from) {
         auto of = [&](unsigned x) { return __uint_as_float((x >> from & 0xffff) << 16); };

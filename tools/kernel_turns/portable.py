@@ -21,7 +21,14 @@ import torch
 from torch import Tensor
 
 from kernel_turns.problems import GPU, Problem, input_scales, int8_inputs, ordinary_bf16, plain, problem, relative
-from turbopi.kernels.portable.denoise.kernel import PHASES, Choices, PortableDenoiser, choices, unavailable
+from turbopi.kernels.portable.denoise.kernel import (
+    PHASES,
+    Choices,
+    PortableDenoiser,
+    choices,
+    multiprocessors,
+    unavailable,
+)
 from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.quantization.formats import INT8
 
@@ -30,7 +37,7 @@ STEPS, CACHE_ROWS, SEED = 10, 976, 1
 
 def variants(tokens: int) -> list[Choices]:
     """The shipped choice first, then changes of it."""
-    usual = choices(tokens)
+    usual = choices(tokens, blocks=multiprocessors(GPU))
     changes: list[dict[str, Any]] = [
         {},
         {"ahead": not usual.ahead},

@@ -2,21 +2,27 @@
 
 __device__ __forceinline__ float2 two(const float* from) { return __ldg((const float2*)from); }
 
-// 1 / rms of all tokens, from the sums of squares of all tiles.
+// 1 / rms of all tokens, from the sums of squares of all tiles. A warp has every WARPS-th token, all on their way at once.
 __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) {
   const int thread = thread_of_phase(), warp = thread / 32, lane = thread % 32;
+  constexpr int OWN = (T + WARPS - 1) / WARPS;
+  float sums[OWN] = {}, mine = 0;
 #pragma unroll
-  for (int first = 0; first < T; first += WARPS) {
-    const int token = first + warp;
-    float sum = 0;
-    if (token < T)
+  for (int i = 0; i < OWN; ++i) {
+    const int token = i * WARPS + warp;
+    if (i * WARPS + WARPS <= T || token < T)
 #pragma unroll
       for (int tile = 0; tile < D_TILES; tile += 32)
-        if (tile + lane < D_TILES) sum += __ldcg(args.squares + token * D_TILES + tile + lane);
-#pragma unroll
-    for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
-    if (token < T && lane == 0) smem[S_RMS + token] = rsqrtf(sum / D + args.eps);
+        if (tile + lane < D_TILES) sums[i] += __ldcg(args.squares + token * D_TILES + tile + lane);
   }
+#pragma unroll
+  for (int by = 16; by; by /= 2)
+#pragma unroll
+    for (int i = 0; i < OWN; ++i) sums[i] += __shfl_xor_sync(~0u, sums[i], by);
+#pragma unroll
+  for (int i = 0; i < OWN; ++i)
+    if (lane == i) mine = sums[i];
+  if (lane < OWN && lane * WARPS + warp < T) smem[S_RMS + lane * WARPS + warp] = rsqrtf(mine / D + args.eps);
 }
 
 // The same in front of a product. Of a narrow stream some threads have a token of the block's range: their loads go in front
@@ -70,6 +76,13 @@ struct Normed {
     if (MODULATED && i.valid) f.shift = two(shifted + i.tile * 8 + i.pair * 2);
     if (SCALED && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
     return f;
+  }
+  // Those of the block's tiles, to L2
+  __device__ __forceinline__ void ahead(int first, int end) const {
+    const int tile = first + threadIdx.x;
+    if (tile >= end) return;
+    if (MODULATED) to_l2(shifted + tile * 8);
+    if (SCALED) to_l2(scales + tile * 8);
   }
   __device__ __forceinline__ float2 apply(Item i, Factors f, float2 sum) const {
     const float by = inverse_rms[i.token];

@@ -202,6 +202,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
                            (unsigned short*)args.queries,
                            (unsigned short*)args.keys,
                            (unsigned short*)args.values};
+          finish.normed.ahead(product.first, product.end);
           InverseRms<QkvShape> inverse_rms{args, smem};
           product.run(grid, smem, args.stream, finish, inverse_rms);
         }
@@ -234,6 +235,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
         ahead<QkvShape>(next + QKV_AT);
         cache_ahead(args, layer + 1 < L ? layer + 1 : 0, length);
         FinishGateUp finish{{shifted + QKV_ROWS, scales + (SCALED ? QKV_ROWS : 0), smem + S_RMS}, args.hidden};
+        finish.normed.ahead(product.first, product.end);
         InverseRms<GateUpShape> inverse_rms{args, smem};
         product.run(grid, smem, args.stream, finish, inverse_rms);
       }

@@ -65,17 +65,19 @@ MANY = Choices(warps=8, sums=16, weights=8, activations=14, ahead=True)
 
 
 NARROW = Choices(warps=16, sums=8, weights=8, activations=7, ahead=True)  # of SmolVLA's width
-# The same on a GPU of as many multiprocessors as an H200: on fewer a block has so many tiles that addresses are spilled
+# On a GPU of as many multiprocessors as an H200: on fewer a block has so many tiles that addresses are spilled
 IN_RANGES = Choices(
     warps=16, sums=4, weights=12, activations=8, ahead=True, ranges=2, wide_ranges=4, across_at_once=True
 )
+MANY_IN_RANGES = replace(FEW, ranges=2, wide_ranges=2)
 MANY_BLOCKS = 132
 
 
 def choices(suffix: int, form: Form = PI05, blocks: int = 0) -> Choices:
+    in_ranges = suffix > 16 and blocks >= MANY_BLOCKS
     if not form.modulated:
-        return IN_RANGES if suffix > 16 and blocks >= MANY_BLOCKS else NARROW
-    return FEW if suffix <= 16 else MANY
+        return IN_RANGES if in_ranges else NARROW
+    return FEW if suffix <= 16 else MANY_IN_RANGES if in_ranges else MANY
 
 
 def unavailable(device: torch.device, weights: WeightNumbers = "bf16") -> str | None:
@@ -107,7 +109,7 @@ ARGS = Struct(
         *OF_LAUNCH,
         Parameter("float*", "x", "[T][D] the residual stream"),
         Parameter("float*", "squares", "[T][D/8] of x, added up by tiles"),
-        Parameter("unsigned char*", "stream", "[chunk][T][columns of a chunk] x times a norm's scale; zeros beyond D"),
+        Parameter("unsigned char*", "stream", "[piece][T][columns of a piece] x times a norm's scale; zeros beyond D"),
         Parameter("unsigned char*", "attended", "the same of attention's outputs"),
         Parameter("unsigned char*", "hidden", "the same of the feed-forward's hidden units"),
         Parameter("unsigned char*", "queries", "bf16 [T * n][K]"),

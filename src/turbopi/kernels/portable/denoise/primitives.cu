@@ -78,9 +78,9 @@ __device__ __forceinline__ u32 pack(float low, float high) {
 }
 __device__ __forceinline__ float low_of(u32 v) { return __uint_as_float(v << 16); }
 __device__ __forceinline__ float high_of(u32 v) { return __uint_as_float(v & 0xffff0000u); }
-// Two neighbouring columns of an activation [chunk][token][CHUNK columns] that meets weights.
+// Two neighbouring columns of an activation [piece][token][PIECE columns] that meets weights.
 __device__ __forceinline__ void store_operand(byte* activation, int token, int column, float first, float second) {
-  byte* const to = activation + ((column / CHUNK * T + token) * CHUNK + column % CHUNK) * OPERAND_BYTES;
+  byte* const to = activation + ((column / PIECE * T + token) * PIECE + column % PIECE) * OPERAND_BYTES;
 #if TP_FP8
   unsigned short both;
   asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(second), "f"(first));
@@ -107,8 +107,9 @@ __device__ __forceinline__ void mma_operands(float (&c)[4], u32 a0, u32 a1, u32 
 #endif
 // Bytes 0 and 2 of four int8 as two bfloat16, exactly: 128 and the low seven bits, less 128, or 256 of negative ones.
 __device__ __forceinline__ u32 two_of_int8(u32 four) {
-  const u32 sum = (four & 0x007f007f) | 0x43004300, less = (four & 0x00800080) | 0x43004300;
-  u32 v;
+  u32 sum, less, v;  // of `and`, `or` one instruction; ptxas makes two of the operators
+  asm("lop3.b32 %0, %1, %2, %3, 0xEA;" : "=r"(sum) : "r"(four), "n"(0x007f007f), "n"(0x43004300));
+  asm("lop3.b32 %0, %1, %2, %3, 0xEA;" : "=r"(less) : "r"(four), "n"(0x00800080), "n"(0x43004300));
   asm("fma.rn.bf16x2 %0, %1, %2, %3;" : "=r"(v) : "r"(less), "r"(0xbf80bf80u), "r"(sum));  // sum - less
   return v;
 }

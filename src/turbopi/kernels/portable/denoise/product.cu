@@ -60,7 +60,7 @@ struct Product {
       for (int piece = 0; piece < PIECES; ++piece) {
         a[group][piece] = make_uint4(0, 0, 0, 0);
         if (there && token < T && (S::RANGES == 1 || token < from() + S::RANGE))
-          a[group][piece] = load_shared_by_grid(activation + ((at * T + token) * PIECES + piece) * 64 + lane % 4 * 16);
+          a[group][piece] = load_shared_by_grid(activation + ((at * PIECES + piece) * T + token) * 64 + lane % 4 * 16);
       }
     }
   }
@@ -125,9 +125,19 @@ struct Product {
               half % 2 ? make_float2(of[2], of[3]) : make_float2(of[0], of[1]);
         }
       __syncthreads();
+      constexpr int ITEMS = S::PASS_TILES * S::RANGE * 4;
+      // For the next item's factors, where registers aren't short
+      constexpr bool ASKS_AHEAD = MODULATED && S::PASSES == 1 && ITEMS > THREADS;
+      Item next = mine;
+      auto next_factors = factors;
 #pragma unroll 1
-      for (int index = thread; index - lane < S::PASS_TILES * S::RANGE * 4; index += THREADS) {
-        if (pass > 0 || index >= THREADS) mine = item(pass, index), factors = finish.factors(mine);
+      for (int index = thread; index - lane < ITEMS; index += THREADS) {
+        if (ASKS_AHEAD) {
+          mine = next, factors = next_factors;
+          next = item(pass, index + THREADS), next_factors = finish.factors(next);
+        } else if (pass > 0 || index >= THREADS) {
+          mine = item(pass, index), factors = finish.factors(mine);
+        }
         float2 sum = make_float2(0, 0);
         if (mine.valid) {
           const int row = (mine.tile - first - pass * S::PASS_TILES) * S::SUM_ROWS + mine.token - from();

@@ -21,7 +21,7 @@
 // Products: a *tile* is 8 output channels, a *chunk* is the part of the reduction of which a lane has 16 bytes of weights
 // (32 columns of bfloat16, 64 of E4M3 or int8). Activations are operand A of mma.sync (16 tokens), weights operand B (8 channels). The
 // order of columns within a chunk is free as long as both operands have the same, so a lane takes 16 bytes that lie side
-// by side: [tile][chunk][8 channels][32 columns] of weights, [chunk][token][32 columns] of activations, both coalesced.
+// by side: [tile][chunk][8 channels][32 columns] of weights, [piece][token][32 columns] of activations, both coalesced.
 // A block has whole tiles; its warps share out the chunks, and above that (WN) the tiles; their sums meet in shared memory.
 // Weights depend on nothing: their first loads are asked for before the barrier in front of the phase, and those of later
 // phases are brought to L2 (TP_AHEAD) while DRAM has nothing else to do.
@@ -45,6 +45,7 @@ constexpr bool SCALED = FP8 || INT8;          // each output channel has a scale
 constexpr int WEIGHT_BYTES = SCALED ? 1 : 2, OPERAND_BYTES = FP8 ? 1 : 2;  // an operand: an activation that meets weights
 constexpr int CHUNK = 64 / WEIGHT_BYTES;                 // columns
 constexpr int PIECES = OPERAND_BYTES / WEIGHT_BYTES;     // of 64 bytes: a token's activations in a chunk
+constexpr int PIECE = CHUNK / PIECES;                    // columns. Tokens lie side by side, so that lines are read whole
 constexpr int CHUNK_BYTES = 512;           // of a tile
 constexpr int ROWS = T * GROUP;  // of the queries of a key/value head, row = token * GROUP + head in the group
 constexpr int HEAD_ROW_TILES = (ROWS + 15) / 16, ROW_TILES = KV_HEADS * HEAD_ROW_TILES;
