@@ -9,6 +9,7 @@ import pytest
 from cli_helpers import refusal, turbopi
 from doc_tables.measured import WRITTEN, stale_measured, write_measured
 from msgspec.structs import replace
+from packed import read_packed_benchmark
 
 from turbopi.bench.document import Result, read_benchmark
 from turbopi.bench.gpus import find_gpu, published_gpus
@@ -37,10 +38,10 @@ NEAR = 1.25  # a prediction by one job's measurement is that near to what other 
 def checked_in() -> list[tuple[str, str, Result]]:
     """(file, key of the GPU, result) of every checked-in measurement of full-size calls on a GPU of the table."""
     found = []
-    files = [*(ROOT / "benchmarks/results").glob("*.json"), *(ROOT / "benchmarks/results").glob("*/results.json")]
+    files = [*(ROOT / "benchmarks/results").glob("*.json"), *(ROOT / "benchmarks/results").glob("*/results.json*")]
     for file in files:
         try:
-            document = read_benchmark(file)
+            document = read_packed_benchmark(file)
         except ConfigError:
             continue  # another kind of result
         gpu = document.provenance.gpu

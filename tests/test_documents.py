@@ -13,13 +13,13 @@ from doc_tables.__main__ import main
 from doc_tables.results import RESULTS
 from doc_tables.tables import TABLES, headline, whole_calls
 from msgspec import to_builtins
+from packed import content_of, read_packed_benchmark
 
-from turbopi.bench.document import read_benchmark
 from turbopi.bench.work import Job
 from turbopi.support.provenance import provenance
 
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-26_pi05_libero" / "results.json"
+RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-26_pi05_libero" / "results.json.xz"
 _LINK = re.compile(r"\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)\)")
 
 
@@ -109,7 +109,7 @@ def project(folder: Path, table: str) -> Path:
     """A project with one document and one result file."""
     results = folder / "benchmarks" / "results" / "a"
     results.mkdir(parents=True)
-    (results / "results.json").write_text(RESULT.read_text(encoding="utf-8"))
+    (results / "results.json").write_bytes(content_of(RESULT))
     (folder / "README.md").write_text(f"before\n<!-- table: {table} -->\n<!-- end of table -->\nbehind\n")
     return folder
 
@@ -229,7 +229,7 @@ def test_an_output_of_another_job_or_kind_is_refused(name: str, text: str, said:
 
 
 def test_tables_hold_the_numbers_of_their_job() -> None:
-    document = read_benchmark(RESULT)
+    document = read_packed_benchmark(RESULT)
     (measured,) = [result for result in document.main_results if (result.backend, result.precision) == ("fused", "fp8")]
     median = measured.milliseconds["total"].p50
     assert f"**{median:.1f} ms**" in headline(document)[2]

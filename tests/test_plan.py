@@ -13,6 +13,7 @@ from doc_tables import fleet as fleet_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from packed import content_of
 from test_serve_schedule import PAYING, SERIAL, request, simulate, table
 
 from turbopi.bench import batch_table
@@ -31,7 +32,7 @@ from turbopi.support.errors import ConfigError
 ROOT = Path(__file__).parents[1]
 NO_BENCHMARK = ROOT / "benchmarks" / "results" / "h200_2026-11-26_small_policy" / "judged.json"
 SETTINGS = settings(max_examples=60, deadline=None)  # how long an example takes says nothing
-RESULT = ROOT / "benchmarks/results/h200_2026-11-26_pi05_libero/results.json"
+RESULT = ROOT / "benchmarks/results/h200_2026-11-26_pi05_libero/results.json.xz"
 
 
 @st.composite
@@ -304,7 +305,7 @@ def test_measured_batches_are_taken_as_soon_as_there_are_some(monkeypatch: pytes
 
 
 def test_the_times_of_a_benchmarks_file_are_taken(tmp_path: Path) -> None:
-    document = json.loads(RESULT.read_text())
+    document = json.loads(content_of(RESULT))
     main = [one for one in document["results"] if one["job"] == document["main_job"] and one["precision"] == "bf16"]
     for batch in (2, 4):
         again = json.loads(json.dumps(main[0]))

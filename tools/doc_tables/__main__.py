@@ -6,7 +6,7 @@ benchmarks/results/, or check that they agree.
 
 A table stands between two lines of a document, which name what it shows and of which files:
 
-    <!-- table: main_job h200_2026-11-26_pi05_libero/results.json -->
+    <!-- table: main_job h200_2026-11-26_pi05_libero/results.json.xz -->
     <!-- end of table -->
 
 `tables.py` has one function for each name; behind each table stand links to its files. The plots are those that
