@@ -272,7 +272,7 @@ def test_a_backend_that_cannot_says_which_can(policy: UnifiedPolicy, monkeypatch
     monkeypatch.setattr(type(policy.backend), "forms", ("tokens",))
     observation = policy.example_observation()
     policy.infer(observation, previous=RunningChunk(rows(8), 2, mode="rtc_identity"))
-    message = "backend 'pytorch' has no guidance by the true Jacobian; take backend 'fused', 'cuda_graph' or 'pytorch'"
+    message = "backend 'pytorch' has no guidance by the true Jacobian; leave out conditioning and previous"
     with pytest.raises(ObservationError, match=message):
         policy.infer(observation, previous=RunningChunk(rows(8), 2))
     with pytest.raises(ConfigError, match="real-time mode 'rtc'; this policy has rtc_identity, rtc_trained"):

@@ -41,6 +41,7 @@ INSTRUCTIONS = (
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
     ("lop3.b32 %0, %1, %2, %3, 0xEA", "and_or"),
     *(("fma.rn.bf16x2", "fma_bf16x2"), ("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
+    *(("cvt.rni.sat.s8", "cvt_s8"), ("cvt.rn.f32.s32", "cvt_float")),
     *(("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2"), ("m8n8.x4.shared.b16", "ldmatrix")),
     *(("m16n8k16.row.col.f32.bf16", "mma_bf16"), ("m16n8k16.row.col.f32.f16", "mma_half")),
     *(("m16n8k32.row.col.f32.e4m3", "mma_e4m3"), ("red.release.gpu.global.add.u32", "add_released")),

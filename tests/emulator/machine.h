@@ -482,6 +482,10 @@ inline void ptx_fma_bf16x2(unsigned& both, unsigned a, unsigned b, unsigned c) {
     };
     both = one(16) << 16 | one(0);
 }
+inline void ptx_cvt_s8(int& whole, float x) {
+    whole = x != x ? 0 : int(std::nearbyint(std::min(std::max(x, -128.0f), 127.0f)));
+}
+inline void ptx_cvt_float(float& x, int whole) { x = float(whole); }
 inline void ptx_cvt_e4m3x2(unsigned short& both, float high, float low) {
     both = machine::to_e4m3(high) << 8 | machine::to_e4m3(low);
 }

@@ -47,10 +47,8 @@ FAULTS = (
     Fault(
         "M and N swapped at the FP8 product's launch",
         "turbopi.kernels",
-        "norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),\n"
-        "        **copy_arguments(copy, n),\n        **size_arguments(m, n,",
-        "norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),\n"
-        "        **copy_arguments(copy, n),\n        **size_arguments(n, m,",
+        '"mark_pitch": stream.stride(0)}),\n        **size_arguments(m, n,',
+        '"mark_pitch": stream.stride(0)}),\n        **size_arguments(n, m,',
         "rows beyond the result are written, columns of it are not",
         (ARGUMENTS, GEOMETRY),
     ),

@@ -33,7 +33,7 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import TIERS, PrecisionPlan
 from turbopi.quantization.sites import KINDS
 from turbopi.support.errors import BackendUnavailable, DeviceLost
 from turbopi.support.toolchain import missing_for_c
@@ -66,6 +66,7 @@ class FusedBackend(CudaGraphBackend):
     _without: Mapping[str, str] = MappingProxyType({})  # what failed its self-test on this GPU, and how
     _kept_expert: Mapping[str, ScaledMatrix] = MappingProxyType({})  # in eight bits, of a folder that has them so
     _on_hopper = True  # whether kernels for compute capability 9.0 run
+    _plan: PrecisionPlan | None = None
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
     instead: ClassVar[str] = "backend 'pytorch' with precision 'bf16'"
 
