@@ -549,7 +549,7 @@ def test_fp8_without_a_calibration_and_the_reverse_are_refused() -> None:
 
 
 def test_other_backends_have_no_fp8() -> None:
-    with pytest.raises(ConfigError, match="backend 'pytorch' runs in bf16 or f32, not in 'fp8'"):
+    with pytest.raises(ConfigError, match="backend 'pytorch' doesn't run in 'fp8': only bf16 or f32"):
         backends.check("pytorch", torch.device("cpu"), "fp8")
     assert backends.choose(torch.device("cpu"), "fp8")[0] == "fused"
 

@@ -164,9 +164,9 @@ def test_it_needs_a_calibration_and_runs_in_nothing_but_fp8(calibration: Quantiz
         ConfigError, match="precision 'fp8' needs a calibration; make one with `turbopi calibrate --prec"
     ):
         emulated(None, "fp8")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="backend 'emulated_fp8' runs in fp8 or fp8-mlp, not in 'bf16'"):
+    with pytest.raises(ConfigError, match="backend 'emulated_fp8' doesn't run in 'bf16': only fp8 or fp8-mlp"):
         backends.check("emulated_fp8", CPU, "bf16")
-    with pytest.raises(ConfigError, match="backend 'emulated_int8' runs in int8, not in 'fp8'"):
+    with pytest.raises(ConfigError, match="backend 'emulated_int8' doesn't run in 'fp8': only int8"):
         backends.check("emulated_int8", CPU, "fp8")
 
 

@@ -187,7 +187,7 @@ def test_compare_runs_each_way_with_the_same_noise(tmp_path: Path) -> None:
         ("compare a", "compare needs two runs or more, but got 1: a"),
         (f"compare {QUICK} pytorch:f32 warp:f32", "'warp:f32' is neither the folder of an evaluation nor a way to run"),
         (f"compare {QUICK} pytorch:f32:1 pytorch", "the same way to run is named twice"),
-        (f"compare {QUICK} pytorch:f32 emulated_fp8:bf16", "backend 'emulated_fp8' runs in fp8 or fp8-mlp, not in"),
+        (f"compare {QUICK} pytorch:f32 emulated_fp8:bf16", "backend 'emulated_fp8' doesn't run in 'bf16': only fp8"),
         (f"compare {QUICK} pytorch:f32 emulated_fp8:fp8", "precision 'fp8' needs a calibration"),
         (f"compare {QUICK} pytorch:f32 pytorch:bf16 --quantization x.json", "none of these is"),
     ],

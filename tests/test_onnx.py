@@ -512,13 +512,13 @@ def test_the_command_line_takes_the_precision_that_the_backend_has(
     assert "precision: f32, as onnx doesn't run in bf16" in result.stdout, result.output
     assert f"its ONNX export stays for the next start: {kept.default_folder()}" in result.stdout
     refused = turbopi("demo", *words, "--frames", 1, "--report", tmp_path, "--precision", "bf16")
-    assert refused.exit_code == 2 and "backend 'onnx' runs in f32, not in 'bf16'" in refused.stderr
+    assert refused.exit_code == 2 and "backend 'onnx' doesn't run in 'bf16': only f32" in refused.stderr
 
 
 def test_other_devices_and_precisions_are_refused() -> None:
     with pytest.raises(BackendUnavailable, match="it runs ONNX Runtime's CPU provider; use device 'cpu'"):
         backends.check("onnx", torch.device("cuda", 0), "f32")
-    with pytest.raises(ConfigError, match="backend 'onnx' runs in f32, not in 'bf16'"):
+    with pytest.raises(ConfigError, match="backend 'onnx' doesn't run in 'bf16': only f32"):
         backends.check("onnx", CPU, "bf16")
 
 

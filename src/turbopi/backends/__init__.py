@@ -316,7 +316,7 @@ def check(
     if precision not in (own := all_precisions(name)):
         where = " (models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU)"
         where *= precision == WEIGHTS_ALONE
-        raise ConfigError(f"backend {name!r} runs in {' or '.join(own)}, not in {precision!r}{where}")
+        raise ConfigError(f"backend {name!r} doesn't run in {precision!r}: {where[2:-1] or 'only ' + ' or '.join(own)}")
     if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
         raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"

@@ -54,7 +54,7 @@ class FusedSmolVLABackend(CapturedBackend):
 
     name: ClassVar[str] = "fused"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
-    # measured on an H200, h200_2026-11-29_smolvla_batches.json: one observation has the denoising kernel, several don't
+    # on an H200, h200_2026-11-29_smolvla_batches.json.xz: one observation has the denoising kernel, several don't
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.99, 4: 2.58, 8: 3.77}
     _dtype: ClassVar[torch.dtype] = torch.bfloat16
 
