@@ -95,7 +95,8 @@ def test_what_is_missed_is_reported_and_what_is_out_of_order_refused(
     policy: UnifiedPolicy, server: PolicyServer
 ) -> None:
     first, gap, late, same, after = replies(
-        server, [sent(0, step=5), sent(1, step=8), sent(2, step=7), sent(2, step=8), sent(3, step=9, seed=1)]
+        server,
+        [sent(0, step=5, seed=1), sent(1, step=8, seed=1), sent(2, step=7), sent(2, step=8), sent(3, step=9, seed=1)],
     )
     assert isinstance(first, dict) and first["memory"] == {"observations": 1, "missed": 0}
     assert isinstance(gap, dict) and gap["memory"] == {"observations": 2, "missed": 2}
