@@ -188,7 +188,7 @@ def test_where_no_cluster_fits_it_is_asked_once(monkeypatch: pytest.MonkeyPatch)
 
 def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (attention, suffix):
-        monkeypatch.setattr(module, "result_dtype", lambda x, inverse: E4M3)  # as on a GPU
+        monkeypatch.setattr(module, "result_dtype", lambda x, inverse, numbers=E4M3: numbers)  # as on a GPU
     heads, tokens, length = 4, 10, 40
     machine(0)
     qkv = random(tokens, 3 * heads * 24)
