@@ -183,9 +183,10 @@ def test_a_backend_is_left_out_only_in_one_of_several_precisions() -> None:
         ("f32", "pytorch"),
         ("f32", "onnx"),
     ]
-    both.check(CPU)
+    checkpoint = random_checkpoint("pi05_tiny")
+    both.check(CPU, checkpoint)
     with pytest.raises(ConfigError, match="onnx"):
-        BenchPlan(["onnx"], ["bf16"]).check(CPU)
+        BenchPlan(["onnx"], ["bf16"]).check(CPU, checkpoint)
 
 
 def test_the_line_over_steps_is_found() -> None:
@@ -532,4 +533,4 @@ def test_batches_are_planned() -> None:
     assert [plan.judges(job) for job in plan.jobs()] == [False, True, False]
     joined = BenchPlan(["pytorch"], ["f32"], batches=[2, 4], joins=["none", "held"])
     assert [(job.batch, job.join) for job in joined.jobs()] == [(2, "none"), (4, "none"), (2, "held"), (4, "held")]
-    joined.check(CPU)
+    joined.check(CPU, random_checkpoint("pi05_tiny"))

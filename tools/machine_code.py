@@ -61,16 +61,13 @@ def _product(tile: Tile, epilogue: Epilogue, residual: bool, folder: Path | None
     return nvrtc.compile_cubin(source, ARCH, bf16.constants(tile, epilogue, residual), folder=folder)
 
 
-def _product_fp8(tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp8: bool, folder: Path | None) -> bytes:
-    takes = bf16.parameters(fp8=True, residual=copied > 0, normed=False, copied=copied > 0)
-    sizes = fp8.constants(tile, epilogue, out_fp8, fp8.promotion(tile, inner), copied > 0, 0, copied)
-    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True), ARCH, sizes, folder=folder)
-
-
-def _product_int8(tile: Tile, epilogue: Epilogue, folder: Path | None) -> bytes:
-    takes = bf16.parameters(fp8=True, residual=False, normed=False, copied=False, marks=True)
-    sizes = fp8.constants(tile, epilogue, True, 0, whole=True, marks=True)
-    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True, whole=True), ARCH, sizes, folder=folder)
+def _product_fp8(
+    tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp8: bool, folder: Path | None, *, int8: bool = False
+) -> bytes:
+    takes = bf16.parameters(fp8=True, residual=copied > 0, normed=False, copied=copied > 0, marks=int8)
+    promote = 0 if int8 else fp8.promotion(tile, inner)
+    sizes = fp8.constants(tile, epilogue, out_fp8, promote, copied > 0, 0, copied, whole=int8, marks=int8)
+    return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True, whole=int8), ARCH, sizes, folder=folder)
 
 
 def _attention(
@@ -110,7 +107,7 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     ),
     "prefix's GeGLU, bf16": partial(_product, Tile(3, 128, 1, 2, overlap=True), "geglu", False),
     "prefix's GeGLU, fp8": partial(_product_fp8, Tile(3, 128, cluster_n=2, overlap=True), "geglu", 2048, 0, True),
-    "prefix's GeGLU, int8": partial(_product_int8, Tile(2, 256, cluster_n=2), "geglu"),
+    "prefix's GeGLU, int8": partial(_product_fp8, Tile(2, 256, cluster_n=2), "geglu", 2048, 0, True, int8=True),
     "prefix's attention, int8": partial(_attention, attention.AttentionTile(256, 64), False, in_int8=True),
     "vision's qkv in batches, bf16": partial(_product, Tile(2, 176, 2, overlap=True), "bias", False),
     "vision's fc1 in batches, fp8": partial(_product_fp8, Tile(2, 184, overlap=True), "gelu", 1152, 0, True),

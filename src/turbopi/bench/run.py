@@ -86,7 +86,7 @@ class BenchPlan:
             self.writes_tokens,
         )
 
-    def check(self, device: torch.device, checkpoint: Checkpoint | None = None) -> None:
+    def check(self, device: torch.device, checkpoint: Checkpoint) -> None:
         """Raise ConfigError or BackendUnavailable for a backend or precision that can't run, before anything is run."""
         if not self.backends or not self.precisions:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
@@ -100,10 +100,7 @@ class BenchPlan:
                 raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
         for precision, name in itertools.product(self.precisions, named):
             if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.all_precisions(name):
-                if checkpoint is None:
-                    backends.check(name, device, precision)
-                else:
-                    check_backend(name, device, precision, checkpoint)
+                check_backend(name, device, precision, checkpoint)
 
     def jobs(self) -> Iterator[Job]:
         for horizon, cameras, size, tokens in itertools.product(

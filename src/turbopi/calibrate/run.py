@@ -70,7 +70,7 @@ class Progress:
 
 
 def check_family(checkpoint: Checkpoint) -> None:
-    """Raise ConfigError for a model that no calibration is for, before anything is asked for or loaded."""
+    """Raise ConfigError for a model that no calibration is for, before anything else is read."""
     if (family := family_of(checkpoint.config.model)).planned:
         return
     other = ", or on an NVIDIA GPU in 'int8-weights', which needs none" if family.reader is not None else ""

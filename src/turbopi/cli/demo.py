@@ -213,9 +213,8 @@ class _Run:
             table.add_column(str(step), justify="right")
         for group in action_groups(self.robot, dims):
             table.add_section()
-            for index, name in group.names.items():
-                label = name if name == group.title or name.startswith("action ") else f"{group.title} {name}"
-                table.add_row(label, group.unit, *(f"{value:+.3f}" for value in actions[:shown, index]))
+            for index in group.names:
+                table.add_row(group.label(index), group.unit, *(f"{value:+.3f}" for value in actions[:shown, index]))
         self.output.table(table)
 
     def _show_check(self) -> None:

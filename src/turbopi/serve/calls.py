@@ -285,12 +285,11 @@ class PolicyCalls:
                 return Ran([results], _turn_seconds(results))
             return Ran([[self._counted(self._infer(observation, {})) for observation in call.observations]])
         (observation,) = call.observations
+        self._metrics.batch_size.observe(1)
         if self._pipelined and not call.arguments:
             started = time.perf_counter()
-            self._metrics.batch_size.observe(1)
             future = self._submit_to_policy(observation)
             return Ran([future], time.perf_counter() - started)
-        self._metrics.batch_size.observe(1)
         result = self._counted(self._infer(observation, call.arguments))
         if call.answer is not None and result.error is None and not self.waiting:
             call.answer(result)

@@ -20,6 +20,11 @@ class ActionGroup:
     names: dict[int, str]  # dimension -> what it moves
     limits: tuple[float, float] | None = None
 
+    def label(self, index: int) -> str:
+        """What a dimension moves, for a place where the group's title isn't shown."""
+        name = self.names[index]
+        return name if name == self.title or name.startswith("action ") else f"{self.title} {name}"
+
 
 def _numbered(prefix: str, indices: Sequence[int]) -> dict[int, str]:
     return {index: f"{prefix} {number}" for number, index in enumerate(indices, start=1)}

@@ -281,11 +281,7 @@ def _signal(rule: Rule, limit: float, compared: Compared, control: Compared) -> 
 def _actions(robot: str, compared: Compared, control: Compared) -> ActionsDocument:
     call, errors = compared.worst
     groups = action_groups(robot, len(compared.by_dimension))
-    labels = {
-        index: (name if name == group.title or name.startswith("action ") else f"{group.title} {name}", group.unit)
-        for group in groups
-        for index, name in group.names.items()
-    }
+    labels = {index: (group.label(index), group.unit) for group in groups for index in group.names}
     own, plain = ([errors.document for errors in some.by_dimension] for some in (compared, control))
     return ActionsDocument(
         **asdict(compared.actions.document),
