@@ -37,7 +37,7 @@ PRECISIONS = ("bf16", "fp8", "int8")
 STAGES = ("vision", "prefix", "denoise")
 MOST_TOKENS: dict[Kernels, int] = {"hopper": 56, "portable": 64}  # that the denoising kernels take: their MAX_SUFFIX
 _BYTES = {"bf16": 2, "fp8": 1, "int8": 1}
-# Of the published rates, by a large bf16 matmul and a large copy on the H200: h200_2026-11-24_portable_kernels.json
+# Of the published rates, by a large bf16 matmul and a large copy on the H200: h200_2026-11-27_in_layers/batches.json.xz
 REACHED = {"matmul": 0.78, "copy": 0.88}
 MMA_SYNC = (8, 12)  # compute capabilities' first numbers
 CLOCKS = (0.75, 1.5)  # of a cycle of Hopper's 1.98 GHz: published clocks are 1.3 GHz (Jetson AGX Orin) to 2.6 (GeForce)
