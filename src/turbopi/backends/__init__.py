@@ -314,9 +314,10 @@ def check(
     if given is not None and not _is_for(precision, model):
         raise ConfigError(f"{_not_for(precision, model)}{_instead(device, precision, model, kept)}")
     if precision not in (own := all_precisions(name)):
-        where = " (models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU)"
-        where *= precision == WEIGHTS_ALONE
-        raise ConfigError(f"backend {name!r} doesn't run in {precision!r}: {where[2:-1] or 'only ' + ' or '.join(own)}")
+        where = f"only {' or '.join(own)}"
+        if precision == WEIGHTS_ALONE:
+            where = "models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU"
+        raise ConfigError(f"backend {name!r} doesn't run in {precision!r}: {where}")
     if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
         raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
