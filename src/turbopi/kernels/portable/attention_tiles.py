@@ -35,7 +35,7 @@ MOST, FEWER = 160, 100  # sums a thread: with more it spills
 PACKED_ROWS = 64  # as `Segments.tiles` says
 USUAL: dict[Attention, tuple[AttentionTile, AttentionTile]] = {  # the second where there is less room
     "vision_attention": (AttentionTile(64, 64, 4, 3), AttentionTile(64, 64, 4, 3)),
-    "prefix_attention": (AttentionTile(64, 64, 4, 2), AttentionTile(64, 32, 8, 2)),
+    "prefix_attention": (AttentionTile(64, 64, 4, 2), AttentionTile(32, 32, 4, 2)),
     "packed_attention": (AttentionTile(PACKED_ROWS, 64, 8, 2), AttentionTile(PACKED_ROWS, 32, 8, 2)),
     "suffix_attention": (AttentionTile(16, 64, 4, 2), AttentionTile(16, 32, 4, 2)),
 }
@@ -46,7 +46,7 @@ OTHERS: dict[Attention, tuple[AttentionTile, ...]] = {
     ),
     "prefix_attention": (
         *(AttentionTile(64, 64, 8, 2), AttentionTile(64, 32, 4, 2), AttentionTile(64, 32, 4, 3)),
-        *(AttentionTile(128, 64, 8, 2), AttentionTile(128, 32, 8, 2), AttentionTile(32, 32, 4, 2)),
+        *(AttentionTile(128, 64, 8, 2), AttentionTile(128, 32, 8, 2), AttentionTile(64, 32, 8, 2)),
     ),
     "packed_attention": (AttentionTile(PACKED_ROWS, 32, 4, 2), AttentionTile(PACKED_ROWS, 32, 8, 3)),
     "suffix_attention": (
