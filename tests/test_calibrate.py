@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from contextlib import nullcontext
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from shared import TWO_LAYERS
 from torch import nn
 
 from turbopi import backends
+from turbopi.backends import Precision
 from turbopi.calibrate import run
 from turbopi.calibrate.observations import read_examples, split
 from turbopi.calibrate.run import Settings, by_harm, calibrate_model
@@ -485,6 +487,16 @@ def test_each_precision_finds_its_own_file_beside_the_weights(tmp_path: Path) ->
     assert found is not None and found.numbers == "int8"
 
 
+def test_float16_sums_need_a_calibration_that_measured_and_allows_them() -> None:
+    with pytest.raises(ConfigError, match="is older than fp8-f16sums; run `turbopi calibrate` again or take 'fp8'"):
+        made_up().plan(TINY, "fp8-f16sums")
+    for rms, cosine, allowed in ((0.14, 0.99, True), (0.2, 0.998, True), (0.2, 0.99, False), (np.nan, np.nan, False)):
+        held = {"fp8": {"relative_rms": 0.1}, "fp8-f16sums": {"relative_rms": rms, "delta_cosine": cosine}}
+        found = made_up(report={"held_out": held, "target": 0.9975})
+        with nullcontext() if allowed else pytest.raises(ConfigError, match="is beyond 0"):
+            assert found.plan(TINY, "fp8-f16sums").scales == found.plan(TINY, "fp8").scales
+
+
 def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
     whole = made_up().plan(TINY, "fp8")
     assert len(whole.scales) == len(sites(TINY)) and not whole.kept
@@ -517,21 +529,27 @@ def test_a_kept_site_is_described_with_its_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("capability", "reason"),
-    [((8, 0), "from compute capability 8.9 on; this GPU has 8.0"), ((8, 7), "8.7"), ((8, 9), ""), ((12, 0), "")],
+    ("precision", "capability", "reason"),
+    [
+        *(("fp8", (8, 0), "from compute capability 8.9 on; this GPU has 8.0"), ("fp8", (8, 7), "8.7")),
+        *(("fp8", (8, 9), ""), ("fp8", (12, 0), ""), ("fp8-f16sums", (8, 9), ""), ("fp8-f16sums", (12, 0), "")),
+        *(
+            ("fp8-f16sums", (8, 6), "8.6; take precision 'bf16' or 'int8'"),
+            ("fp8-f16sums", (10, 0), "10.0; take .*'fp8'"),
+        ),
+        ("fp8-f16sums", (9, 0), "TURBOPI_KERNELS=portable .*; take precision 'bf16' or 'fp8' or 'int8'"),
+    ],
 )
-def test_gpus_whose_tensor_cores_have_no_fp8_are_refused(
-    capability: tuple[int, int], reason: str, monkeypatch: pytest.MonkeyPatch
+def test_gpus_whose_tensor_cores_have_no_fp8_or_gain_nothing_are_refused(
+    precision: Precision, capability: tuple[int, int], reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from turbopi.backends.fused import FusedBackend
 
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     monkeypatch.setattr(FusedBackend, "unavailable", classmethod(lambda cls, device: None))
-    if reason:
-        with pytest.raises(BackendUnavailable, match=rf"can't run in fp8 on cuda:0: .*{reason}"):
-            backends.check("fused", torch.device("cuda", 0), "fp8")
-    else:
-        backends.check("fused", torch.device("cuda", 0), "fp8")
+    refused = pytest.raises(BackendUnavailable, match=rf"can't run in {precision} on cuda:0: .*{reason}")
+    with refused if reason else nullcontext():
+        backends.check("fused", torch.device("cuda", 0), precision)
     backends.check("fused", torch.device("cuda", 0), "bf16")
 
 
@@ -639,10 +657,10 @@ def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Pa
     assert len(report["observations"]["calibration"]) == len(report["observations"]["held_out"]) == 1
     assert report["random_weights"] is True and report["target_reached"] is True
     assert set(report["methods"]) == {"max", "headroom", "percentile", "mse"}
-    assert set(report["held_out"]) >= {"fp8", "fp8-mlp", "bf16", "fp8 against bf16", "worst"}
+    assert set(report["held_out"]) >= {"fp8", "fp8-mlp", "fp8-f16sums", "bf16", "fp8 against bf16", "worst"}
     calibration = Quantization.load(out)
     calibration.check(TINY, random_checkpoint("pi05_tiny").fingerprint())
-    assert not calibration.plan(TINY, "fp8").kept
+    assert not calibration.plan(TINY, "fp8-f16sums").kept
     arguments = {"precision": "fp8", "quantization": out, "device": "cpu"}
     with pytest.raises(BackendUnavailable, match=r"backend 'fused' can't run on cpu: .*NVIDIA GPU"):
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments)  # type: ignore[arg-type]

@@ -297,7 +297,7 @@ def test_convert_refuses_wrong_paths(arguments: list[str], expected: str) -> Non
 def test_convert_refuses_an_unknown_precision(tmp_path: Path) -> None:
     result = turbopi("convert", "--random-weights", "pi05_tiny", tmp_path / "x", "--precision", "fp16", "--json")
     assert result.exit_code == 2
-    assert "error: --precision is 'fp16'; expected one of bf16, f32, fp8, fp8-mlp, int8" in result.stderr
+    assert "error: --precision is 'fp16'; expected one of bf16, f32, fp8, fp8-mlp, fp8-f16sums, int8" in result.stderr
     assert not (tmp_path / "x").exists()
 
 

@@ -66,7 +66,7 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     scales = {site: plan.scales[str(site)] for site in sites(model.config) if str(site) in plan.scales}
     assert 0 < len(scales) < len(sites(model.config)) or tier != "fp8-mlp"
     weights = RoundedWeights({site: plan.directions[str(site)] for site in scales}, plan.format)
-    with rounded(model, scales, weights):
+    with rounded(model, scales, weights, plan.half_sums):
         expected = model.sample(case.observation, case.noise, STEPS)[0]
     ours = actions(emulated(calibration, tier))
     assert torch.equal(ours[0], expected)

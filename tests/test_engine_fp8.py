@@ -247,14 +247,17 @@ def batch_weights(backend: FusedBackend, loop: Loop) -> Weights:
     return weights
 
 
-def test_batches_denoise_in_fp8_with_matrices_of_their_own_which_go_with_the_last_of_them() -> None:
-    backend = fused(CPU, whole_calibration())
+@pytest.mark.parametrize("tier", ["fp8", "fp8-f16sums"])
+def test_batches_denoise_in_fp8_with_matrices_of_their_own_which_go_with_the_last_of_them(tier: Tier) -> None:
+    backend = fused(CPU, whole_calibration(), tier)
+    matrix = backend._weights.vision[0].fc2[0]
+    assert isinstance(matrix, ScaledMatrix) and matrix.half_sums == (tier == "fp8-f16sums")
     expert = batch_weights(backend, PLAIN_LOOP).expert
     assert backend._plan is not None and not backend._expert.users["layers"]
     for i, (ours, bf16) in enumerate(zip(expert, backend._weights.expert, strict=True)):
         for kind in ("qkv", "out", "gate_up", "down"):
             made, was, scale = getattr(ours, kind), getattr(bf16, kind), backend._plan.scales[f"expert.{i}.{kind}"]
-            assert isinstance(made, ScaledMatrix) and made.inverse == 1 / scale
+            assert isinstance(made, ScaledMatrix) and made.inverse == 1 / scale and not made.half_sums
             assert float((made.dequantized() - was).norm() / was.norm()) < 0.05
     assert batch_weights(backend, BY_TOKEN).expert is expert
     assert backend.describe()["fp8"]["plan"]["expert of batches"] == "fp8"

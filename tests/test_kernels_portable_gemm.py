@@ -152,6 +152,38 @@ def test_nan_shows_and_too_much_saturates() -> None:
     assert bool((ours[[0, 1, 3]].abs() == E4M3_MAX).all())
 
 
+@FP8_HERE
+@pytest.mark.parametrize("epilogue", EPILOGUES)
+def test_float16_sums_lose_a_hundredth_of_what_e4m3_does(epilogue: Epilogue) -> None:
+    m, n, k = (130, 136, 4304) if ON_GPU else (33, 72, 272)
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k, FP8)
+    half, bias = replace(matrix.for_half_sums(), dtype=torch.float32), None if epilogue == "geglu" else random(n)
+    assert relative(half.dequantized(), matrix.dequantized()) < 2e-4
+    most = max(float(block.float().abs().sum(1).max()) for block in torch.split(half.data, 128, 1)) * E4M3_MAX
+    assert most < torch.finfo(torch.float16).max < 3 * most, "whatever x is, none overflows"
+    meant = exactly(x, half, epilogue, bias)
+    assert 1e-5 < relative(meant, exactly(x, matrix, epilogue, bias)) < 5e-4
+    for tile in tiles.candidates(HERE, True, epilogue, k, half_sums=True) if ON_GPU else SMALL:
+        ours = product(x, half, epilogue, bias, tile=tile)
+        assert relative(ours.sum(0) if tile.splits > 1 else ours, meant) < (2e-3 if ON_GPU else 1e-6), tile
+
+
+@FP8_HERE
+def test_float16_sums_hold_the_largest_numbers_and_nan_shows() -> None:
+    k = 4304 if ON_GPU else 272
+    x, data = torch.full((4, k), E4M3_MAX, device=DEVICE), torch.full((16, k), E4M3_MAX, device=DEVICE)
+    x[1], x[2, ::2], x[3, 5], data[0, 7] = -E4M3_MAX, -E4M3_MAX, torch.nan, torch.nan
+    data[1, 5:] = 2.0
+    whole = ScaledMatrix(to_e4m3(data, 1.0), torch.ones(16, device=DEVICE), 1.0, torch.float32)
+    half = whole.for_half_sums()
+    assert torch.equal(half.dequantized()[1:], data[1:]) and half.scale[1:3].tolist() == [32, 512]
+    for tile in tiles.candidates(HERE, True, "plain", k, half_sums=True) if ON_GPU else SMALL:
+        ours = product(to_e4m3(x, 1.0), half, tile=tile)
+        assert bool(ours[3].isnan().all()) or not ON_GPU, "the interpreter has no such NaN"
+        assert bool(ours[:, 0].isnan().all()) and not ours[2, 2:].any()
+        torch.testing.assert_close(ours[:2, 1:], x[:2] @ data[1:].T, rtol=0.01 if ON_GPU else 4e-4, atol=0)
+
+
 @on_gpu
 def test_the_bfloat16_geglu_in_the_epilogue_is_as_good_as_behind_the_product() -> None:
     x, gate_up = random(203, 2048), random(2 * 4304, 2048) / 2048**0.5
@@ -288,6 +320,7 @@ def test_the_chosen_tile_fits_the_gpu(capability: Capability, rows: int, n: int,
         tile = tiles.best_tile(capability, fp8, epilogue, rows, n, k, 100)
         assert tile.takes(capability, epilogue, fp8 and tiles.promotes(capability, k))
         assert tile.splits == 1 or epilogue == "parts"
+    assert tiles.best_tile(capability, True, epilogue, rows, n, k, 100, True).takes(capability, epilogue, True)
 
 
 def test_a_gpu_nobody_has_seen_gets_tiles_that_fit_the_smallest() -> None:
@@ -332,6 +365,10 @@ def test_fp8_is_refused_below_8_9_and_says_why() -> None:
     for capability in ((8, 0), (8, 6), (8, 7)):
         why = tiles.fp8_refusal(capability)
         assert why is not None and f"this GPU has {capability[0]}.{capability[1]}" in why
+        assert tiles.half_sums_refusal(capability) == why
+    for capability in tiles.BLOCK_SHARED:
+        if capability >= (8, 9):
+            assert (tiles.half_sums_refusal(capability) is None) == (capability[0] in (8, 9, 12))
 
 
 # Which kernels

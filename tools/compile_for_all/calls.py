@@ -95,14 +95,15 @@ def product_calls(target: Target, chosen: bool = False) -> Calls:
     Splits of the inner axis are two, which stands for more.
     """
     calls: Calls = []
-    for of_numbers in (*eight_bits(target), BF16):
+    halves = [(E4M3, True)] if tiles.half_sums_refusal(target.capability) is None else []
+    for of_numbers, half in [*((one, False) for one in (*eight_bits(target), BF16)), *halves]:
         for _, epilogue, m, n, k, bias, behind in PRODUCTS:
             if of_numbers == BF16 and (epilogue != "geglu" or behind):
                 continue  # the library's
-            for tile in tiles.candidates(target.capability, of_numbers != BF16, epilogue, k):
+            for tile in tiles.candidates(target.capability, of_numbers != BF16, epilogue, k, half):
                 if tile.splits <= 2:
                     used = None if chosen else tile
-                    calls.append(partial(_product, of_numbers, epilogue, m, n, k, bias, behind, used))
+                    calls.append(partial(_product, of_numbers, epilogue, m, n, k, bias, behind, used, half))
     return calls
 
 
@@ -115,10 +116,11 @@ def _product(
     bias: bool,
     behind: bool,
     tile: tiles.Tile | None,
+    half: bool,
 ) -> Tensor:
     rows = 2 * n if epilogue == "geglu" else n
     data = of(rows, k, dtype=numbers)
-    weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16)
+    weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16, half)
     input: Input = {"inverse": 30.0, "numbers": numbers} if behind else {}
     added = of(n) if bias else None
     return product(of(m, k, dtype=numbers), weight, epilogue, added, tile=tile, **input, **_marks(input))

@@ -20,7 +20,7 @@ from turbopi.config import ModelConfig, Network
 from turbopi.engine.graph import preparing
 from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import EIGHT_BITS, TIERS, WEIGHTS_ALONE, format_of
+from turbopi.quantization.plan import EIGHT_BITS, HALF_SUMS, TIERS, WEIGHTS_ALONE, format_of
 from turbopi.support import extensions
 from turbopi.support.errors import BackendUnavailable, ConfigError
 
@@ -322,8 +322,8 @@ def check(
         raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
     if precision in EIGHT_BITS and reason is not None and device.type != "cuda":
-        which = {"int8": "8.x, 9.0 or 12.x", WEIGHTS_ALONE: "8.0 or newer"}.get(precision, "8.9 or newer")
-        reason = f"{precision} needs an NVIDIA GPU of compute capability {which}"
+        which = {"int8": "8.x, 9.0 or 12.x", WEIGHTS_ALONE: "8.0 or newer", HALF_SUMS: "8.9 or 12.x"}
+        reason = f"{precision} needs an NVIDIA GPU of compute capability {which.get(precision, '8.9 or newer')}"
         reason += _instead(device, precision, model, kept)
     elif precision in TIERS and (other_gpu := cls.unavailable_in(device, precision)) is not None:
         reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
@@ -348,8 +348,12 @@ def _instead(device: torch.device, precision: Precision, model: Network, kept: b
     """What to do where one of `EIGHT_BITS` can't run: what this model can on this device. Empty if that is nothing."""
     if kept:
         return ""
-    runs: dict[str, Precision] = {"cuda_graph": WEIGHTS_ALONE, "fused": "fp8" if precision == "int8" else "int8"}
-    others = [one for name, one in runs.items() if _is_for(one, model) and refusal(name, device, one, model) is None]
+    runs: tuple[tuple[str, Precision], ...] = (("cuda_graph", WEIGHTS_ALONE), ("fused", "fp8"), ("fused", "int8"))
+    others = [
+        one
+        for name, one in runs
+        if one != precision and _is_for(one, model) and refusal(name, device, one, model) is None
+    ]
     advice = "; take precision " + " or ".join(map(repr, ("bf16", *others)))
     if device.type != "cuda" and precision in TIERS and _is_for(precision, model):
         format = format_of(precision)

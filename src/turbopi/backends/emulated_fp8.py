@@ -6,15 +6,18 @@ reference, so `auto` never takes them. Everything that isn't rounded is float32 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.engine.emulate import Round, input_rounding, put_into_norm, round_weight
+from turbopi.engine.emulate import Round, input_rounding, put_into_norm, put_product, round_weight
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.models.pi0.conditioning import Form
 from turbopi.models.pi0.sites import linears, norm_of
+from turbopi.quantization.fp8 import Matrix, to_e4m3
 from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites
 
@@ -40,8 +43,13 @@ class EmulatedFp8Backend(PyTorchBackend):
             rounding = input_rounding(site, scale, format)
             if norm is not None:
                 put_into_norm(norm, rounding)
+            directions = self._plan.directions.get(str(site))
             for linear in linears(self.model, site):
-                linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)), format)
+                if self._plan.has_half_sums(str(site)):
+                    matrix = quantize(linear.weight.data, scale, directions).for_half_sums()
+                    put_product(linear, partial(to_e4m3, inverse=1 / scale), partial(_given, matrix))
+                    continue
+                linear.weight.data = round_weight(linear.weight.data, directions, format)
                 if norm is None:
                     linear.register_forward_pre_hook(_before(rounding))
 
@@ -62,6 +70,10 @@ class EmulatedInt8Backend(EmulatedFp8Backend):
 
     name: ClassVar[str] = "emulated_int8"
     precisions: ClassVar[tuple[Precision, ...]] = ("int8",)
+
+
+def _given(matrix: Matrix, weight: Tensor) -> Matrix:
+    return matrix
 
 
 def _before(rounding: Round) -> Callable[[nn.Module, tuple[Tensor, ...]], tuple[Tensor, ...]]:

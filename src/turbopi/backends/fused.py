@@ -33,7 +33,7 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix
-from turbopi.quantization.plan import TIERS, PrecisionPlan
+from turbopi.quantization.plan import HALF_SUMS, TIERS, PrecisionPlan
 from turbopi.quantization.sites import KINDS
 from turbopi.support.errors import BackendUnavailable, DeviceLost
 from turbopi.support.toolchain import missing_for_c
@@ -97,9 +97,17 @@ class FusedBackend(CudaGraphBackend):
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
         if precision not in TIERS or importlib.util.find_spec("triton") is None:  # which `unavailable` tells
             return None
-        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
+        from turbopi.kernels.ops import KERNELS_VARIABLE, forced_portable
+        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, half_sums_refusal, int8_refusal
 
         capability = torch.cuda.get_device_capability(device)
+        if precision == HALF_SUMS:
+            if capability == (9, 0) and not forced_portable():
+                return (
+                    "Hopper's kernels sum in float32, at the same rate; those that "
+                    f"{KERNELS_VARIABLE}=portable takes have float16 sums"
+                )
+            return half_sums_refusal(capability)
         if precision == "int8":
             return int8_refusal(capability)
         return fp8_refusal(capability)
@@ -317,7 +325,8 @@ class FusedBackend(CudaGraphBackend):
     def _quantized(self, place: str, matrix: Matrix) -> Matrix:
         if self._plan is None or place not in self._plan.scales:
             return matrix
-        return quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
+        made = quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
+        return made.for_half_sums() if self._plan.has_half_sums(place) else made
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)

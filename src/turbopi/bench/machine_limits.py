@@ -14,6 +14,7 @@ _DTYPES = {
     "int8-weights": torch.bfloat16,
     "fp8": torch.float8_e4m3fn,
     "fp8-mlp": torch.float8_e4m3fn,
+    "fp8-f16sums": torch.float8_e4m3fn,
     "int8": torch.int8,
 }
 

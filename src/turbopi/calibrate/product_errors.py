@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.engine.emulate import Round, RoundedWeights, input_rounding, replaced, through_norm
+from turbopi.engine.emulate import MakeMatrix, Round, RoundedWeights, input_rounding, replaced, through_norm
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.layers import AdaRMSNorm
 from turbopi.models.pi0.reference import Pi0Model
@@ -24,7 +24,7 @@ def product_errors(
     """Site -> relative rms of its products (without bias) of rounded numbers, over all batches and steps."""
     sums: dict[str, Tensor] = {}  # of squares: of the difference, of the exact products
     behind: dict[Site, Tensor] = {}  # what norms make of rounded activations
-    changes: list[tuple[nn.Linear, Round, Round]] = []
+    changes: list[tuple[nn.Linear, Round, MakeMatrix]] = []
     handles = []
     for site, scale in scales.items():
         norm, rounding = norm_of(model, site), input_rounding(site, scale, weights.format)

@@ -37,7 +37,7 @@ class WorstCall(Struct, frozen=True):
     relative_rms: float
 
 
-class HeldOut(Struct, frozen=True):
+class HeldOut(Struct, frozen=True, omit_defaults=True):
     """Of FP8, on observations that chose nothing. The sites that are kept run in float32 here."""
 
     fp8: ActionsError
@@ -48,6 +48,7 @@ class HeldOut(Struct, frozen=True):
     bf16: ActionsError
     fp8_against_bf16: ActionsError = field(name="fp8 against bf16")
     worst: WorstCall
+    f16sums: ActionsError | None = field(name="fp8-f16sums", default=None)  # not in older files
 
     def errors(self) -> dict[str, ActionsError]:
         """All but the worst call's, by the name that the file has for each."""
@@ -71,7 +72,8 @@ class Int8HeldOut(Struct, frozen=True):
 
 def _errors(held_out: Struct) -> dict[str, ActionsError]:
     names = zip(held_out.__struct_fields__, held_out.__struct_encode_fields__, strict=True)
-    return {name: getattr(held_out, own) for own, name in names if own != "worst"}
+    found = {name: getattr(held_out, own) for own, name in names if own != "worst"}
+    return {name: error for name, error in found.items() if error is not None}
 
 
 class CalibrationReport(Struct, frozen=True):

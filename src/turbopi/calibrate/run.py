@@ -34,7 +34,7 @@ from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, Si
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
-from turbopi.quantization.plan import refusal
+from turbopi.quantization.plan import HALF_SUMS, refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import plain_document
@@ -285,10 +285,12 @@ class _Trials:
     def calls(self) -> list[NoisyExample]:
         return [call for calls, _ in self._made for call in calls]
 
-    def actions(self, scales: Mapping[Site, float], model: Pi0Model | None = None) -> list[Tensor]:
+    def actions(
+        self, scales: Mapping[Site, float], model: Pi0Model | None = None, half_sums: bool = False
+    ) -> list[Tensor]:
         """Of every batch, with these sites rounded."""
         used = model or self._model
-        with rounded(used, scales, self._weights):
+        with rounded(used, scales, self._weights, half_sums):
             return [used.sample(observation, noise, self._steps) for observation, noise in self.batches]
 
     def error(self, actions: Sequence[Tensor], against: Sequence[Tensor] | None = None) -> dict[str, float]:
@@ -407,13 +409,14 @@ def _held_out(
     name = trials.format.name
     cases: dict[str, dict[Site, float]] = {name: used}
     if name == "fp8":
+        cases[HALF_SUMS] = used
         cases["fp8-mlp"] = {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"}
     cases |= {f"{name} in the {part} alone": {s: used[s] for s in used if s.part == part} for part in PARTS}
     progress.begin("held-out observations", len(cases) + 1)
     report: dict[str, Any] = {}
     actions = {}
     for case, own in cases.items():
-        actions[case] = trials.actions(own)
+        actions[case] = trials.actions(own, half_sums=case == HALF_SUMS)
         report[case] = trials.error(actions[case])
         progress.advance()
     state = {name: tensor.to(parameter_dtype(name, "bf16")) for name, tensor in model.state_dict().items()}

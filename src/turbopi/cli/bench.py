@@ -219,7 +219,7 @@ def bench(
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
     quantization: Annotated[
-        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8, fp8-mlp or int8.")
+        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for FP8 or INT8.")
     ] = None,
     predict: Annotated[
         str | None,

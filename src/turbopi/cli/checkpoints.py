@@ -326,7 +326,7 @@ def convert(
         str,
         typer.Option(
             "--precision",
-            metavar="bf16|f32|fp8|fp8-mlp|int8",
+            metavar="bf16|f32|fp8|fp8-mlp|fp8-f16sums|int8",
             help="In which the weights are written. In eight bits: for backend fused in this precision alone.",
         ),
     ] = "bf16",
@@ -350,7 +350,7 @@ def convert(
 
     Its statistics and a turbopi.json that describes it are there, too. Any format that Turbo-Pi reads goes in;
     --random-weights makes a checkpoint to try things with. --robot is recorded in the turbopi.json, a description
-    beside it. In eight bits (fp8, fp8-mlp, int8) the folder has the calibration and loads without the checkpoint.
+    beside it. In eight bits the folder has the calibration and loads without the checkpoint.
     """
     output = Output(as_json)
     write = _writer(precision, quantization, device)

@@ -222,8 +222,8 @@ class PolicyOptions(RobotOptions):
             "--precision",
             panel=_RUNNING,
             metavar="NAME",
-            help="bf16 as openpi serves it, f32, int8-weights (Pi0-FAST), or calibrated: fp8, fp8-mlp, int8. Unless "
-            "given, the folder's own, else bf16, or what --backend has instead.",
+            help="bf16 as openpi serves it, f32, int8-weights (Pi0-FAST), or calibrated: fp8, fp8-mlp, fp8-f16sums, "
+            "int8. Unless given, the folder's own, else bf16, or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[

@@ -4,7 +4,7 @@ The oracle of the engine's FP8 and INT8, and the instrument that says what they 
 device.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -18,10 +18,11 @@ from turbopi.models.pi0.layers import AdaRMSNorm, inverse_rms
 from turbopi.models.pi0.reference import Pi0Model
 from turbopi.models.pi0.sites import linears, norm_of
 from turbopi.quantization.formats import FP8, Format
-from turbopi.quantization.fp8 import Directions, ScaledMatrix
+from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.sites import Site
 
 Round = Callable[[Tensor], Tensor]
+MakeMatrix = Callable[[Tensor], Matrix]
 
 
 def round_activation(x: Tensor, scale: float, format: Format = FP8) -> Tensor:
@@ -50,19 +51,31 @@ class RoundedWeights:
             self._rounded[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site), self.format)
         return self._rounded[id(weight)][1].dequantized().to(weight.dtype)
 
+    def in_half_sums(self, site: Site, scale: float, weight: Tensor) -> ScaledMatrix:
+        """The same, for an input's numbers with this scale."""
+        self(site, weight)
+        return self._rounded[id(weight)][1].for_input(scale).for_half_sums()
+
 
 @contextmanager
-def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None) -> Iterator[None]:
-    """For a while, matmuls of these sites are of rounded numbers, of the weights' format."""
+def rounded(
+    model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None, half_sums: bool = False
+) -> Iterator[None]:
+    """For a while, matmuls of these sites are of rounded numbers, of the weights' format; with `half_sums` the expert's
+    alone have float32 sums.
+    """
     rounding = weights or RoundedWeights()
-    changes: list[tuple[nn.Linear, Round, Round]] = []
+    changes: list[tuple[nn.Linear, Round, MakeMatrix]] = []
     norms: list[tuple[AdaRMSNorm, Round]] = []
     for site, scale in scales.items():
         inputs = input_rounding(site, scale, rounding.format)
         if (norm := norm_of(model, site)) is not None:
             norms.append((norm, inputs))
             inputs = _as_it_is
-        changes += [(linear, inputs, partial(rounding, site)) for linear in linears(model, site)]
+        of_site: MakeMatrix = partial(rounding, site)
+        if half_sums and site.part != "expert":
+            inputs, of_site = partial(to_e4m3, inverse=1 / scale), partial(rounding.in_half_sums, site, scale)
+        changes += [(linear, inputs, of_site) for linear in linears(model, site)]
     with replaced(changes), replaced_in_norms(norms):
         yield
 
@@ -70,6 +83,18 @@ def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeigh
 def input_rounding(site: Site, scale: float, format: Format) -> Round:
     """What becomes of a site's activation."""
     return partial(round_activation, scale=scale, format=format) if format.rounds_input(site.part) else _as_it_is
+
+
+def multiplied(x: Tensor, weight: Matrix, bias: Tensor | None) -> Tensor:
+    """x @ weightᵀ + bias; of a ScaledMatrix x is of its numbers, and the result float32."""
+    if not isinstance(weight, ScaledMatrix):
+        return F.linear(x, weight, bias)
+    return weight.product(x.flatten(0, -2), bias).view(*x.shape[:-1], -1)
+
+
+def put_product(linear: nn.Linear, inputs: Round, weights: MakeMatrix) -> None:
+    """From now on `linear` is of what the two functions make of its input and of its weight."""
+    linear.__dict__["forward"] = lambda x: multiplied(inputs(x), weights(linear.weight), linear.bias)
 
 
 def _as_it_is(x: Tensor) -> Tensor:
@@ -101,17 +126,11 @@ def replaced_in_norms(changes: list[tuple[AdaRMSNorm, Round]]) -> Iterator[None]
 
 
 @contextmanager
-def replaced(changes: list[tuple[nn.Linear, Round, Round]]) -> Iterator[None]:
+def replaced(changes: Sequence[tuple[nn.Linear, Round, MakeMatrix]]) -> Iterator[None]:
     """For a while, these matmuls are of what the two functions make of their input and of their weight."""
     try:
-        for linear, inputs, weights in changes:
-
-            def forward(
-                x: Tensor, linear: nn.Linear = linear, inputs: Round = inputs, weights: Round = weights
-            ) -> Tensor:
-                return F.linear(inputs(x), weights(linear.weight), linear.bias)
-
-            linear.__dict__["forward"] = forward
+        for change in changes:
+            put_product(*change)
         yield
     finally:
         for linear, _, _ in changes:

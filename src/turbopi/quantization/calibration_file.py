@@ -17,7 +17,7 @@ import torch
 from turbopi.config import ModelConfig
 from turbopi.quantization.formats import FORMATS, Format, Numbers
 from turbopi.quantization.fp8 import E4M3, Directions
-from turbopi.quantization.plan import TIERS, PrecisionPlan, format_of, reason_for_bf16
+from turbopi.quantization.plan import HALF_SUMS, TIERS, PrecisionPlan, format_of, reason_for_bf16
 from turbopi.quantization.sites import PARTS, Part, sites
 from turbopi.support.errors import CalibrationError, ConfigError
 from turbopi.support.files import write_whole
@@ -26,6 +26,7 @@ from turbopi.support.reading import is_finite, is_integer, one_line, read_json, 
 # version 1 has no directions; 2 has no scales for the expert's activations; 4 says `numbers`. FP8's files are written
 # as version 3, which older Turbo-Pis read, too.
 FORMAT, VERSION, FP8_VERSION = "turbopi-quantization", 4, 3
+HALF_SUMS_COST = 1.5  # times FP8's error: 1.16 was seen by chance, as roundings near an edge fall either way
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
 
 
@@ -169,7 +170,9 @@ class Quantization:
             )
 
     def plan(self, config: ModelConfig, tier: str) -> PrecisionPlan:
-        """What is rounded in a tier, and why the rest isn't. Raises ConfigError for a tier of other numbers."""
+        """What is rounded in a tier, and why the rest isn't. Raises ConfigError for a tier of other numbers, or
+        float16 sums that cost too much.
+        """
         if tier not in TIERS:
             raise ConfigError(f"{tier!r} is no calibrated precision; choose one of {', '.join(TIERS)}")
         if format_of(tier).name != self.numbers:
@@ -178,6 +181,8 @@ class Quantization:
                 f"{self.source or 'this calibration'} is for {self.numbers}, the precision is {tier!r}; make one with "
                 f"`turbopi calibrate --precision {wanted}`"
             )
+        if tier == HALF_SUMS:
+            self._check_half_sums()
         chosen: dict[str, float] = {}
         kept: dict[str, str] = {}
         common: dict[str, Directions] = {}
@@ -192,6 +197,18 @@ class Quantization:
             else:
                 kept[str(site)] = reason
         return PrecisionPlan(tier, chosen, kept, common)
+
+    def _check_half_sums(self) -> None:
+        """Raise ConfigError unless they were measured, and reach the target or cost next to nothing."""
+        held, name = self.report.get("held_out", {}), self.source or "this calibration"
+        if (ours := held.get(HALF_SUMS)) is None:
+            raise ConfigError(f"{name} is older than {HALF_SUMS}; run `turbopi calibrate` again or take 'fp8'")
+        error, most = ours["relative_rms"], HALF_SUMS_COST * held["fp8"]["relative_rms"]
+        if not (ours["delta_cosine"] >= self.report["target"] or error <= most):
+            raise ConfigError(
+                f"{name} doesn't allow {HALF_SUMS}: the held-out actions' error {error:.4f} is beyond {most:.4f} and "
+                "their cosine below the target; take 'fp8'"
+            )
 
     def describe(self, plan: PrecisionPlan) -> dict[str, Any]:
         """What goes into the metadata of a policy that runs with it."""

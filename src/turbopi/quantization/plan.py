@@ -9,12 +9,13 @@ from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, Site
 
 # that a policy runs in; the tiers need a calibration, and weights in INT8 beside activations that aren't rounded none
-Precision = Literal["bf16", "f32", "int8-weights", "fp8", "fp8-mlp", "int8"]
-Fp8Tier = Literal["fp8", "fp8-mlp"]
+Precision = Literal["bf16", "f32", "int8-weights", "fp8", "fp8-mlp", "fp8-f16sums", "int8"]
+Fp8Tier = Literal["fp8", "fp8-mlp", "fp8-f16sums"]
 FP8_TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
-Tier = Literal["fp8", "fp8-mlp", "int8"]
+Tier = Literal["fp8", "fp8-mlp", "fp8-f16sums", "int8"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
 WEIGHTS_ALONE: Final = "int8-weights"
+HALF_SUMS: Final = "fp8-f16sums"  # FP8 whose products of vision and prefix are added up in float16: see fp8.py
 EIGHT_BITS: tuple[Precision, ...] = (WEIGHTS_ALONE, *TIERS)
 
 
@@ -43,6 +44,14 @@ class PrecisionPlan:
         """The denoising kernel takes all of the expert's matrices in one precision: bf16 if any is to be kept so."""
         return "bf16" if any(name.startswith("expert.") for name in self.kept) else self.format.name
 
+    @property
+    def half_sums(self) -> bool:
+        return self.tier == HALF_SUMS
+
+    def has_half_sums(self, site: str) -> bool:
+        """Not the expert's: denoising is bound by reading weights."""
+        return self.half_sums and not site.startswith("expert.")
+
     def without_expert(self, reason: str) -> "PrecisionPlan":
         """The same with the expert in bfloat16, for this reason."""
 
@@ -62,7 +71,8 @@ class PrecisionPlan:
         by_group: dict[str, dict[str, list[str]]] = {}
         for name in [*self.scales, *self.kept]:
             part, layer, kind = name.split(".")
-            state = self.format.name if name in self.scales else f"bf16: {self.kept[name]}"
+            state = f"{self.format.name}{' with float16 sums' * self.has_half_sums(name)}"
+            state = state if name in self.scales else f"bf16: {self.kept[name]}"
             by_group.setdefault(f"{part}.{kind}", {}).setdefault(state, []).append(layer)
         return {
             group: next(iter(states))

@@ -22,7 +22,7 @@ from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint
 from turbopi.policy import shipped
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import FP8_TIERS
+from turbopi.quantization.plan import FP8_TIERS, HALF_SUMS
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.support.files import write_whole
 from turbopi.support.reading import plain_document
@@ -248,7 +248,7 @@ def main() -> None:
     passed = run(
         options.out,
         options.weights or WEIGHTS[1:],
-        options.tier or FP8_TIERS,
+        options.tier or [tier for tier in FP8_TIERS if tier != HALF_SUMS],  # which Hopper's kernels haven't
         preset=options.preset,
         device=options.device,
         calibration=options.calibration,

@@ -1,5 +1,5 @@
-"""x @ weightᵀ with its epilogue: one tile of the result a program. E4M3 or bfloat16 in, float32 sums;
-int8 in, int32 sums.
+"""x @ weightᵀ with its epilogue: one tile of the result a program. E4M3 or bfloat16 in, float32 sums, of E4M3 also
+float16 ones (`quantization.fp8`); int8 in, int32 sums.
 
 Twins: the products of `kernels.plain` with a `ScaledMatrix`, and `linear_geglu` of bfloat16. Triton makes wgmma,
 mma.sync or tcgen05 of the same source, as the GPU has it.
@@ -23,15 +23,17 @@ from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.gemm.tiles import STEP_BYTES, Epilogue, Tile, best_tile, promotes, tuned_tile
 from turbopi.kernels.portable.rounding import as_stored, damaged, marks
 from turbopi.kernels.tile_table import NO_TILES, Numbers, TileTable
-from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Matrix, ScaledMatrix
+from turbopi.quantization.fp8 import ALIGNMENT, E4M3, HALF_BLOCK, Matrix, ScaledMatrix
 
 GROUP = 8  # rows of tiles that are computed together, so that they read the same weights from the L2 cache
 ANYWHERE = (9, 0)  # the GPU that the interpreter's tiles are chosen for
 
 
 @triton.jit
-def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
-    """acc + a bᵀ; with PROMOTE the tensor cores begin at 0 and the sum is float32."""
+def _sum(a, b, acc, PROMOTE: tl.constexpr, HALF: tl.constexpr, DEPTH: tl.constexpr):
+    """acc + a bᵀ; with PROMOTE the tensor cores begin at 0 and the sum is float32; with HALF they add in float16."""
+    if HALF:
+        return acc + tl.dot(a, b.T, out_dtype=tl.float16).to(tl.float32)
     if PROMOTE:
         return acc + tl.dot(a, b.T, max_num_imprecise_acc=DEPTH)
     return tl.dot(a, b.T, acc, input_precision="ieee", out_dtype=acc.dtype)
@@ -41,8 +43,8 @@ def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
 def _product_kernel(
     x, weight, scale, bias, out, rows, columns, inner, inverse, residual, stride,
     GELU: tl.constexpr, GEGLU: tl.constexpr, HAS_BIAS: tl.constexpr, HAS_SCALE: tl.constexpr, SCALED: tl.constexpr,
-    MARKS: tl.constexpr, PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
-    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
+    MARKS: tl.constexpr, PROMOTE: tl.constexpr, HALF: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr,
+    GROUP: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """Tile [BLOCK_M, BLOCK_N] of the result. WHOLE: DEPTH divides `inner`. GEGLU: weight has 2 * columns rows."""
     along_m, along_n = tl.cdiv(rows, BLOCK_M), tl.cdiv(columns, BLOCK_N)
@@ -71,10 +73,10 @@ def _product_kernel(
         else:
             a = tl.load(a_at + at, d[None, :] < inner - at, 0.0)
             b = tl.load(b_at + at, d[None, :] < inner - at, 0.0)
-        acc = _sum(a, b, acc, PROMOTE, DEPTH)
+        acc = _sum(a, b, acc, PROMOTE, HALF, DEPTH)
         if GEGLU:
             c = tl.load(up_at + at) if WHOLE else tl.load(up_at + at, d[None, :] < inner - at, 0.0)
-            up = _sum(a, c, up, PROMOTE, DEPTH)
+            up = _sum(a, c, up, PROMOTE, HALF, DEPTH)
     launch_dependents(PDL)
     there = n < columns
     acc, up = acc.to(tl.float32), up.to(tl.float32)
@@ -123,12 +125,14 @@ def product(
     assert x.dtype == data.dtype and x.is_contiguous() and data.is_contiguous(), "rows are read as they lie in memory"
     assert bias is None or (epilogue != "geglu" and bias.shape == (n,))
     scaled, on = isinstance(weight, ScaledMatrix), gpu(x.device)
+    half = isinstance(weight, ScaledMatrix) and weight.half_sums
     multiplied: Numbers = "bf16" if not scaled else "int8" if data.dtype == torch.int8 else "fp8"
-    tile = tile or tuned_tile(tiles, multiplied, epilogue, m, n, k)
-    tile = tile or best_tile(on[0], scaled, epilogue, m, n, k, on[1])
+    tile = tile or (None if half else tuned_tile(tiles, multiplied, epilogue, m, n, k))  # FP8's may have no room
+    tile = tile or best_tile(on[0], scaled, epilogue, m, n, k, on[1], half)
     assert tile.splits == 1 or epilogue == "parts"
     assert max(x.numel(), data.numel(), tile.splits * m * n) < 1 << 31, "places are counted in 32 bits"
     depth = STEP_BYTES if scaled else STEP_BYTES // 2
+    assert not half or depth == HALF_BLOCK, "a float16 sum is one step's"
     block_n = tile.columns // 2 if epilogue == "geglu" else tile.columns
     if out is None:
         dtype = weight.dtype if inverse is None else result_dtype(x, inverse, numbers)
@@ -139,7 +143,7 @@ def product(
         x, data, weight.scale if isinstance(weight, ScaledMatrix) else x, x if bias is None else bias, out, m, n, k,
         1.0 if inverse is None else inverse,
         GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None, HAS_SCALE=scaled,
-        SCALED=inverse is not None, PROMOTE=x.dtype == E4M3 and promotes(on[0], k), WHOLE=k % depth == 0,
+        SCALED=inverse is not None, PROMOTE=x.dtype == E4M3 and promotes(on[0], k), HALF=half, WHOLE=k % depth == 0,
         SPLIT=tile.splits > 1, GROUP=GROUP, BLOCK_M=tile.rows, BLOCK_N=block_n, DEPTH=depth,
         num_warps=tile.warps, num_stages=tile.stages, **marks(stream, out), **dependent_launch(x),
     )  # fmt: skip

@@ -66,6 +66,14 @@ def fp8_refusal(capability: Capability) -> str | None:
     return f"tensor cores multiply E4M3 from compute capability 8.9 on; this GPU has {capability[0]}.{capability[1]}"
 
 
+def half_sums_refusal(capability: Capability) -> str | None:
+    """Why float16 sums of E4M3 aren't for this GPU; None if they are."""
+    if (why := fp8_refusal(capability)) is not None or capability[0] not in (10, 11):
+        return why
+    has = f"this GPU has {capability[0]}.{capability[1]}"
+    return f"10.x and 11.0 sum in float32 at the same rate; {has}"
+
+
 def int8_refusal(capability: Capability) -> str | None:
     """Why INT8 isn't for this GPU; None if it is. Of E4M3 and bfloat16 Triton makes tcgen05 on 10.x and 11.0."""
     if capability[0] not in (10, 11):
@@ -83,9 +91,11 @@ def promotes(capability: Capability, inner: int) -> bool:
     return inner > UNPROMOTED and capability >= (8, 9) and capability[0] not in (10, 11)
 
 
-def candidates(capability: Capability, fp8: bool, epilogue: Epilogue, inner: int) -> list[Tile]:
+def candidates(
+    capability: Capability, fp8: bool, epilogue: Epilogue, inner: int, half_sums: bool = False
+) -> list[Tile]:
     """All tiles that this GPU takes. fp8: of numbers of eight bits, INT8 too, which takes E4M3's tiles."""
-    promoted = fp8 and promotes(capability, inner)
+    promoted = half_sums or (fp8 and promotes(capability, inner))
     fitting = [tile for tile in TILES if tile.takes(capability, epilogue, promoted)]
     if epilogue != "parts":
         return fitting
@@ -132,10 +142,12 @@ def _resident(tile: Tile, capability: Capability) -> int:
 
 
 @cache
-def best_tile(capability: Capability, fp8: bool, epilogue: Epilogue, m: int, n: int, k: int, sms: int) -> Tile:
+def best_tile(
+    capability: Capability, fp8: bool, epilogue: Epilogue, m: int, n: int, k: int, sms: int, half_sums: bool = False
+) -> Tile:
     """The tile of least estimated cost."""
     m = -(-m // 64) * 64
-    fitting = candidates(capability, fp8, epilogue, k)
+    fitting = candidates(capability, fp8, epilogue, k, half_sums)
     return min(fitting, key=lambda tile: cost(tile, capability, fp8, epilogue, m, n, k, sms))
 
 
