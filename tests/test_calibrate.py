@@ -34,7 +34,7 @@ from turbopi.policy import shipped
 from turbopi.policy.examples import Example, NoisyExample, with_noises
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import VERSION, Quantization, SiteScale, shapes_of
-from turbopi.quantization.formats import FORMATS, FP8, Format
+from turbopi.quantization.formats import FP8, OF_EIGHT_BITS, Format
 from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions
 from turbopi.quantization.sites import PARTS, sites
 from turbopi.recordings import RecordedCall, save_call
@@ -91,7 +91,7 @@ def histogram_of(x: torch.Tensor, format: Format = FP8) -> Histogram:
     return Histogram(bins[:0x7F80].double(), float(x.abs().max()), format)
 
 
-@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("format", OF_EIGHT_BITS.values(), ids=OF_EIGHT_BITS)
 @pytest.mark.parametrize("scale", [1.0, 0.01, 0.0037, 1e-3])
 def test_a_histogram_knows_the_error_of_rounding(scale: float, format: Format) -> None:
     x = torch.randn(200_000, generator=torch.Generator().manual_seed(0))

@@ -19,7 +19,7 @@ from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.models import parameter_shapes
 from turbopi.quantization.directions import directions
-from turbopi.quantization.formats import FORMATS, Format
+from turbopi.quantization.formats import OF_EIGHT_BITS, Format
 from turbopi.quantization.fp8 import Matrix
 from turbopi.support.errors import CheckpointError
 
@@ -96,7 +96,7 @@ def rounded(format: Format) -> Callable[[str, Tensor], Matrix]:
     return make
 
 
-@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("format", OF_EIGHT_BITS.values(), ids=OF_EIGHT_BITS)
 def test_matrices_rounded_as_they_are_read_have_the_bits_of_those_rounded_when_all_is_read(format: Format) -> None:
     model, checkpoint, make = CONFIG.planned_model, random_checkpoint(CONFIG), rounded(format)
     expected = pack(model, checkpoint.load("cpu", "bf16").state, make)

@@ -29,7 +29,7 @@ from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.models.pi0.denoise import euler_step
 from turbopi.models.smolvla.config import SmolVLAConfig
 from turbopi.models.smolvla.family import BASE
-from turbopi.quantization.formats import FORMATS, INT8, Format
+from turbopi.quantization.formats import INT8, OF_EIGHT_BITS, Format
 from turbopi.support.errors import BackendError, BackendUnavailable
 
 CPU = torch.device("cpu")
@@ -46,7 +46,7 @@ def test_packing_keeps_every_weight(name: str) -> None:
 
 
 @SMALL
-@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("format", OF_EIGHT_BITS.values(), ids=OF_EIGHT_BITS)
 def test_packing_in_eight_bits_keeps_every_weight_as_it_is_rounded(name: str, format: Format) -> None:
     p = problem(name, 1, 1, 3, 0, CPU, outliers=True)
     packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=format)

@@ -32,7 +32,7 @@ from turbopi.kernels.plain import PLAIN
 from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import directions
 from turbopi.quantization.formats import Numbers
-from turbopi.quantization.plan import TIERS, Tier
+from turbopi.quantization.plan import KEPT_TIERS, Tier
 from turbopi.quantization.sites import sites
 from turbopi.serve.options import ServerOptions
 from turbopi.support.errors import BackendUnavailable, CalibrationError, CheckpointError, ConfigError
@@ -61,7 +61,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert turbopi("convert", "--random-weights", "pi05_tiny", root / "own").exit_code == 0
     for numbers in ("fp8", "int8"):
         calibration(open_checkpoint(root / "own"), numbers).save(root / "own" / f"turbopi_{numbers}.json")
-    for tier in TIERS:
+    for tier in KEPT_TIERS:
         made = turbopi("convert", root / "own", root / tier, "--precision", tier, "--device", "cpu", "--json")
         assert made.exit_code == 0, made.output
         assert json.loads(made.stdout)["precision"] == tier
@@ -101,7 +101,7 @@ def actions(weights: Weights, config: Any) -> Tensor:
     return answer(call, observation, noise)
 
 
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", KEPT_TIERS)
 def test_the_weights_are_to_the_last_bit_those_of_the_checkpoint_and_its_calibration(tiny: Path, tier: Tier) -> None:
     own, kept = backend_of(tiny / "own", tier), backend_of(tiny / tier, tier)
     assert own._plan is not None and not own._kept_expert

@@ -59,8 +59,9 @@ def test_fp8_is_refused_below_8_9_with_the_reason(tmp_path: Path) -> None:
 def test_every_triton_kernel_is_among_the_calls() -> None:
     done = ours(
         "-c",
-        "import json; from compile_for_all import calls, compiling, launches, targets; hopper = targets.TARGETS[4];"
-        "found = {one.name for one in launches.launches(hopper, calls.all_calls(hopper))};"
+        "import json; from compile_for_all import calls, compiling, launches, targets;"
+        "gpus = targets.TARGETS[4], targets.TARGETS[-1];"  # Hopper, and one with NVFP4
+        "found = {one.name for gpu in gpus for one in launches.launches(gpu, calls.all_calls(gpu))};"
         "print(json.dumps(sorted(compiling.triton_kernels() - found)), len(found))",
     )
     left, count = done.stdout.rsplit(" ", 1)
@@ -76,6 +77,30 @@ def test_weights_are_rounded_to_every_format_on_every_gpu(tmp_path: Path) -> Non
     assert numbers == {
         frozenset({"fp32", "i64", stored, *weights}) for weights in (["bf16"], []) for stored in ("u8", "i8")
     }
+
+
+@pytest.mark.slow
+def test_nvfp4_compiles_where_triton_lowers_it_as_another_gpus(tmp_path: Path) -> None:
+    result = compiled(tmp_path, "--targets", "121,90", "--kernels", "nvfp4")
+    assert [row for row in result.rows if row.problem or row.refused] == []
+    assert {row.target for row in result.rows} == {"sm_121a"} and len(result.rows) == 6
+
+
+def test_another_instruction_in_its_place_is_a_problem() -> None:
+    done = ours(
+        "-c",
+        "from compile_for_all.compiling import INSTRUCTIONS, without_instruction;"
+        "name, wanted = 'nvfp4.product', INSTRUCTIONS['nvfp4.product'];"
+        "print(without_instruction(name, 'wgmma'), without_instruction(name, wanted), without_instruction('a', ''))",
+    )
+    assert done.stdout.strip() == "its PTX has no kind::mxf4nvf4.block_scale.scale_vec::4X None None", done.stderr
+
+
+def test_the_checked_in_result_has_nvfp4_on_blackwell_alone_without_spills() -> None:
+    every = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json.xz").rows
+    rows = [row for row in every if "nvfp4" in row.kernel]
+    assert {row.target for row in rows} == {"sm_100a", "sm_103a", "sm_110a", "sm_120a", "sm_121a"}
+    assert {row.kernel for row in rows} == {"nvfp4.round", "nvfp4.product"} and not any(row.spilled for row in rows)
 
 
 def test_the_checked_in_result_has_e4m3_only_where_triton_has_it() -> None:

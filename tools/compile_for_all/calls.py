@@ -19,6 +19,7 @@ from turbopi.kernels.portable import (
     embedding,
     grouped,
     norms,
+    nvfp4,
     quantize,
     resize,
     rope,
@@ -30,8 +31,9 @@ from turbopi.kernels.portable.attention_tiles import candidates as attention_can
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
-from turbopi.quantization.formats import FORMATS, Format
+from turbopi.quantization.formats import OF_EIGHT_BITS, Format
 from turbopi.quantization.fp8 import E4M3, Directions, ScaledMatrix
+from turbopi.quantization.nvfp4 import BLOCK, Nvfp4Matrix, whole
 
 BF16, F32 = torch.bfloat16, torch.float32
 Calls = list[Callable[[], Any]]
@@ -71,7 +73,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         _one_token,
     ]
     calls += [partial(_geglu, one) for one in inverses]
-    return [*calls, *_weights(), *product_calls(target, chosen)]
+    return [*calls, *_weights(), *product_calls(target, chosen), *four_bits(target)]
 
 
 def eight_bits(target: Target) -> list[torch.dtype]:
@@ -105,6 +107,21 @@ def product_calls(target: Target, chosen: bool = False) -> Calls:
                     used = None if chosen else tile
                     calls.append(partial(_product, of_numbers, epilogue, m, n, k, bias, behind, used, half))
     return calls
+
+
+def four_bits(target: Target) -> Calls:
+    """NVFP4's products, each with the rounding of its activation, where the GPU takes them."""
+
+    def four(epilogue: tiles.Epilogue, m: int, n: int, k: int, bias: bool) -> Tensor:
+        rows, wide = 2 * n if epilogue == "geglu" else n, whole(k)
+        codes, blocks = of(rows, wide // 2, dtype=torch.uint8), of(rows, wide // BLOCK, dtype=E4M3)
+        with_it: Any = "plain" if epilogue == "parts" else epilogue
+        matrix = Nvfp4Matrix(codes, blocks, of(rows, dtype=F32), 0.2, k, BF16)
+        return nvfp4.product(of(m, k), matrix, with_it, of(n) if bias else None)
+
+    if tiles.nvfp4_refusal(target.capability) is not None:
+        return []
+    return [partial(four, epilogue, m, n, k, bias) for _, epilogue, m, n, k, bias, _ in PRODUCTS]
 
 
 def _product(
@@ -380,4 +397,4 @@ def _weights() -> Calls:
         with patch.object(quantize, "feedback", lambda given: feeding):  # PyTorch's operations, which need a GPU
             return quantize.round_rows(of(2048, 1152, dtype=dtype), of(2048, dtype=F32), directions, format)
 
-    return [partial(rounded, format, dtype) for format in FORMATS.values() for dtype in (BF16, F32)]
+    return [partial(rounded, format, dtype) for format in OF_EIGHT_BITS.values() for dtype in (BF16, F32)]

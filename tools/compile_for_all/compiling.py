@@ -39,6 +39,7 @@ from turbopi.support.errors import BackendError
 from turbopi.support.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
 
 HOPPER, THOR = (9, 0), (11, 0)
+INSTRUCTIONS = {"nvfp4.product": "kind::mxf4nvf4.block_scale.scale_vec::4X"}  # of tcgen05.mma and mma.sync
 
 
 def compile_target(target: Target, only: str = "", chosen: bool = False) -> list[Compiled]:
@@ -94,7 +95,14 @@ def compiled_launch(target: Target, launch: Launch) -> Compiled:
     registers, spilled, _ = used(code.asm["cubin"])
     shared = int(code.metadata.shared)
     problem = over_limit(target, registers, shared, launch.threads) or over_allowed(launch.name, target, spilled)
+    problem = problem or without_instruction(launch.name, code.asm["ptx"])
     return row(registers=registers, spilled=spilled, shared=shared, problem=problem)
+
+
+def without_instruction(kernel: str, ptx: str) -> str | None:
+    """That Triton has put something else in place of the tensor cores' instruction, in words."""
+    wanted = INSTRUCTIONS.get(kernel, "")
+    return None if wanted in ptx else f"its PTX has no {wanted}"
 
 
 def over_allowed(kernel: str, target: Target, spilled: int) -> str | None:

@@ -29,7 +29,7 @@ TYPES = {
     torch.int32: "i32",
     torch.int64: "i64",
 }
-OPTIONS = ("num_warps", "num_stages", "launch_pdl", "num_ctas")
+OPTIONS = ("num_warps", "num_stages", "launch_pdl", "num_ctas", "arch")
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,9 @@ class Launch:
     def variant(self) -> str:
         """What sets it apart from the kernel's others."""
         chosen = [f"{name}={int(value)}" for name, value in self.constants if name.isupper() and name != "PDL"]
+        options = [f"{name}={int(v)}" for name, v in self.options if name not in ("launch_pdl", "arch")]
         pointers = sorted({kind[1:] for _, kind in self.signature if kind.startswith("*")})
-        return " ".join([*chosen, *(f"{name}={int(v)}" for name, v in self.options if name != "launch_pdl"), *pointers])
+        return " ".join([*chosen, *options, *pointers])
 
     @property
     def threads(self) -> int:

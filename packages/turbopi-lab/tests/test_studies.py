@@ -19,6 +19,7 @@ from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.policy.call_options import Denoising
 from turbopi.policy.shipped import CHASE_POLICY
 from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.nvfp4 import round_e2m1, round_nvfp4
 from turbopi.quantization.sites import Site
 from turbopi.sim.chase import SPEED as CHASE_SPEED
 from turbopi.support.errors import ConfigError
@@ -374,7 +375,7 @@ def test_mxfp4_is_e2m1_under_powers_of_two() -> None:
     rounded = formats.round_mxfp4(x)
     blocks, exact = rounded.view(8, 2, 32), x.view(8, 2, 32)
     scale = 2.0 ** (torch.floor(torch.log2(exact.abs().amax(-1, keepdim=True))) - 2)
-    assert torch.equal(formats.round_e2m1(blocks / scale), blocks / scale)
+    assert torch.equal(round_e2m1(blocks / scale), blocks / scale)
     within = exact.abs() <= 6 * scale  # others are cut
     assert ((blocks - exact).abs() <= scale)[within].all() and torch.equal(formats.round_mxfp4(rounded), rounded)
     assert torch.equal(formats.round_mxfp4(torch.zeros(2, 32)), torch.zeros(2, 32))
@@ -388,12 +389,12 @@ def test_a_product_without_scales_is_nothing_and_with_unread_ones_is_most_of_it(
 
 def test_scales_in_the_tensor_cores_order_are_the_same_scales_elsewhere() -> None:
     x = torch.randn(128, 64, generator=torch.Generator().manual_seed(0)) * torch.arange(1, 129)[:, None]
-    right, mixed = formats.round_nvfp4(x), formats.nvfp4_with_swizzled_scales(x)
+    right, mixed = round_nvfp4(x), formats.nvfp4_with_swizzled_scales(x)
     assert not torch.equal(right, mixed)
     first = slice(0, 16)  # row 0's first block stays where it is: place 0
     assert torch.equal(right[0, first], mixed[0, first])
     few = x[:64]  # no whole tile: nothing to mix
-    assert torch.equal(formats.round_nvfp4(few), formats.nvfp4_with_swizzled_scales(few))
+    assert torch.equal(round_nvfp4(few), formats.nvfp4_with_swizzled_scales(few))
 
 
 def test_four_bits_are_gone_after_the_block_and_activations_are_rounded_where_that_is_asked_for() -> None:

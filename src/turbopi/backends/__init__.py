@@ -15,12 +15,20 @@ import torch
 
 from turbopi.backends import qualifying
 from turbopi.backends.base import Backend, LoadState, Precision, Sample
-from turbopi.backends.qualification import COMMAND, Verdict, file_of, is_known, verdict_of
+from turbopi.backends.qualification import (
+    COMMAND,
+    UNTRIED,
+    Verdict,
+    file_of,
+    is_known,
+    unqualified,
+    verdict_of,
+)
 from turbopi.config import ModelConfig, Network
 from turbopi.engine.graph import preparing
 from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import EIGHT_BITS, HALF_SUMS, TIERS, WEIGHTS_ALONE, format_of
+from turbopi.quantization.plan import HALF_SUMS, ROUNDED, TIERS, WEIGHTS_ALONE, format_of
 from turbopi.support import extensions
 from turbopi.support.errors import BackendUnavailable, ConfigError
 
@@ -91,7 +99,8 @@ _SPECS = (
         "fused",
         "turbopi.backends.fused",
         "FusedBackend",
-        "cuda_graph with kernels of our own: NVIDIA GPUs from 8.0; FP8 from 8.9 on, INT8 but on 10.x and 11.0",
+        "cuda_graph with kernels of our own: NVIDIA GPUs from 8.0; FP8 from 8.9 on, INT8 but on 10.x and 11.0, NVFP4 "
+        "on 10.x, 11.0 and 12.x",
         unplanned="turbopi.backends.fused_smolvla:FusedSmolVLABackend",
     ),
     BackendSpec(
@@ -105,6 +114,12 @@ _SPECS = (
         "turbopi.backends.emulated_fp8",
         "EmulatedInt8Backend",
         "the reference with a calibration's INT8 roundings, exact and slow, to judge INT8 by: any device",
+    ),
+    BackendSpec(
+        "emulated_nvfp4",
+        "turbopi.backends.emulated_fp8",
+        "EmulatedNvfp4Backend",
+        "the reference with a calibration's NVFP4 roundings, exact and slow, to judge NVFP4 by: any device",
     ),
     BackendSpec(
         "onnx",
@@ -262,6 +277,7 @@ def qualified(
     if (
         (writes and precision not in TIERS)
         or device.type != "cuda"
+        or precision in UNTRIED  # which `create` refuses
         or is_known(device)
         or refusal("fused", device, precision, model) is not None
     ):
@@ -321,15 +337,22 @@ def check(
     if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
         raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
-    if precision in EIGHT_BITS and reason is not None and device.type != "cuda":
-        which = {"int8": "8.x, 9.0 or 12.x", WEIGHTS_ALONE: "8.0 or newer", HALF_SUMS: "8.9 or 12.x"}
-        reason = f"{precision} needs an NVIDIA GPU of compute capability {which.get(precision, '8.9 or newer')}"
+    if precision in ROUNDED and reason is not None and device.type != "cuda":
+        which = {"int8": "8.x, 9.0 or 12.x", "nvfp4": "10.x, 11.0 or 12.x", HALF_SUMS: "8.9 or 12.x"}
+        newer = (which | {WEIGHTS_ALONE: "8.0 or newer"}).get(precision, "8.9 or newer")
+        reason = f"{precision} needs an NVIDIA GPU of compute capability {newer}"
         reason += _instead(device, precision, model, kept)
     elif precision in TIERS and (other_gpu := cls.unavailable_in(device, precision)) is not None:
         reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
         reason += _instead(device, precision, model, kept)
+    elif reason is None and given is not None and name == "fused":
+        reason, what = unqualified(device, precision, given), f"run in {precision}"
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")
+
+
+def _runs(name: str, device: torch.device, precision: Precision, model: Network) -> bool:
+    return _is_for(precision, model) and refusal(name, device, precision, model) is None
 
 
 def _is_for(precision: Precision, model: Network) -> bool:
@@ -345,15 +368,11 @@ def _not_for(precision: Precision, model: Network) -> str:
 
 
 def _instead(device: torch.device, precision: Precision, model: Network, kept: bool) -> str:
-    """What to do where one of `EIGHT_BITS` can't run: what this model can on this device. Empty if that is nothing."""
+    """What to do where one of `ROUNDED` can't run: what this model can on this device. Empty if that is nothing."""
     if kept:
         return ""
-    runs: tuple[tuple[str, Precision], ...] = (("cuda_graph", WEIGHTS_ALONE), ("fused", "fp8"), ("fused", "int8"))
-    others = [
-        one
-        for name, one in runs
-        if one != precision and _is_for(one, model) and refusal(name, device, one, model) is None
-    ]
+    runs: list[tuple[str, Precision]] = [("cuda_graph", WEIGHTS_ALONE), ("fused", "fp8"), ("fused", "int8")]
+    others = [one for name, one in runs if one != precision and _runs(name, device, one, model)]
     advice = "; take precision " + " or ".join(map(repr, ("bf16", *others)))
     if device.type != "cuda" and precision in TIERS and _is_for(precision, model):
         format = format_of(precision)
@@ -382,6 +401,8 @@ def create(
         raise BackendUnavailable(why)
     if (why := _refuses(cls, config, precision)) is not None:
         raise ConfigError(f"backend {name!r} can't run in {precision!r} here: {why}")
+    if name == "fused" and (why := unqualified(device, precision, config)) is not None:
+        raise BackendUnavailable(f"backend {name!r} can't run in {precision} on {device}: {why}")
     with preparing(device):
         return cls(config, load, device=device, precision=precision, quantization=quantization)
 

@@ -1,7 +1,7 @@
-"""Backends `emulated_fp8`, `emulated_int8`: the float32 reference in which all that a calibration has in eight bits is
-rounded, on any device.
+"""Backends `emulated_fp8`, `emulated_int8`, `emulated_nvfp4`: the float32 reference in which all that a calibration has
+in eight bits or four is rounded, on any device.
 
-For judging FP8 and INT8 where no GPU that has them is at hand, closed loop included. They are slower than the
+For judging them where no GPU that has them is at hand, closed loop included. They are slower than the
 reference, so `auto` never takes them. Everything that isn't rounded is float32 here, bfloat16 in `fused`.
 """
 
@@ -70,6 +70,13 @@ class EmulatedInt8Backend(EmulatedFp8Backend):
 
     name: ClassVar[str] = "emulated_int8"
     precisions: ClassVar[tuple[Precision, ...]] = ("int8",)
+
+
+class EmulatedNvfp4Backend(EmulatedFp8Backend):
+    """The same in NVFP4, which vision and prefix alone have."""
+
+    name: ClassVar[str] = "emulated_nvfp4"
+    precisions: ClassVar[tuple[Precision, ...]] = ("nvfp4",)
 
 
 def _given(matrix: Matrix, weight: Tensor) -> Matrix:

@@ -26,12 +26,12 @@ from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.engine.call import CallShape
 from turbopi.engine.loops import Loop
 from turbopi.engine.plan import MAX_CAMERAS, bucket
-from turbopi.engine.weight_placement import HOST, WeightPlacement, is_conditioning
+from turbopi.engine.weight_placement import HOST, WeightPlacement, is_conditioning, rows_of_parts
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops, PairDenoiser
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.quantize import rounded_matrix
 from turbopi.kernels.tile_table import NO_TILES
-from turbopi.quantization.formats import INT8
+from turbopi.quantization.formats import INT8, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix
 from turbopi.quantization.plan import HALF_SUMS, TIERS, PrecisionPlan
 from turbopi.quantization.sites import KINDS
@@ -53,7 +53,7 @@ class Watched(Protocol):
 
 
 class FusedBackend(CudaGraphBackend):
-    """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8 or INT8: `describe()` says what runs."""
+    """As `cuda_graph`, in bfloat16, or partly in FP8, INT8 or NVFP4 as a calibration says: see `describe()`."""
 
     name: ClassVar[str] = "fused"
     # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-27_attention, of 2 without the
@@ -98,19 +98,16 @@ class FusedBackend(CudaGraphBackend):
         if precision not in TIERS or importlib.util.find_spec("triton") is None:  # which `unavailable` tells
             return None
         from turbopi.kernels.ops import KERNELS_VARIABLE, forced_portable
-        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, half_sums_refusal, int8_refusal
+        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, half_sums_refusal, int8_refusal, nvfp4_refusal
 
         capability = torch.cuda.get_device_capability(device)
-        if precision == HALF_SUMS:
-            if capability == (9, 0) and not forced_portable():
-                return (
-                    "Hopper's kernels sum in float32, at the same rate; those that "
-                    f"{KERNELS_VARIABLE}=portable takes have float16 sums"
-                )
-            return half_sums_refusal(capability)
-        if precision == "int8":
-            return int8_refusal(capability)
-        return fp8_refusal(capability)
+        if precision == HALF_SUMS and capability == (9, 0) and not forced_portable():
+            return (
+                "Hopper's kernels sum in float32, at the same rate; those that "
+                f"{KERNELS_VARIABLE}=portable takes have float16 sums"
+            )
+        refusals = {"int8": int8_refusal, "nvfp4": nvfp4_refusal, HALF_SUMS: half_sums_refusal}
+        return refusals.get(precision, fp8_refusal)(capability)
 
     def describe(self) -> dict[str, Any]:
         described = super().describe() | {"tiles": self._tiles.about}
@@ -322,11 +319,12 @@ class FusedBackend(CudaGraphBackend):
             for number, layer in enumerate(layers)
         ]
 
-    def _quantized(self, place: str, matrix: Matrix) -> Matrix:
+    def _quantized(self, place: str, matrix: Matrix) -> Tensor | RoundedMatrix:
         if self._plan is None or place not in self._plan.scales:
             return matrix
-        made = quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
-        return made.for_half_sums() if self._plan.has_half_sums(place) else made
+        directions, parts = self._directions.get(place), rows_of_parts(self.config, place)
+        made = rounded_matrix(matrix, self._plan.scales[place], directions, self._plan.format, parts)
+        return made.for_half_sums() if isinstance(made, ScaledMatrix) and self._plan.has_half_sums(place) else made
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)

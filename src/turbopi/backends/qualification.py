@@ -37,6 +37,8 @@ DENOISE: Final = "denoise"  # the denoising kernel, among names of `kernels.inte
 _SOURCES: Final = ("kernels/**/*.py", "kernels/**/*.cu", "engine/*.py", "backends/*.py", "qualify/*.py")
 _PACKAGES: Final = ("torch", "triton", "cuda-bindings", "nvidia-cuda-nvrtc", "nvidia-cuda-nvrtc-cu12")
 
+UNTRIED: Final = ("nvfp4",)  # precisions that none of those GPUs has
+
 under_test: dict[str, str] | None = None  # in the process that qualifies: what it excludes
 Taken = Literal["fused", "cuda_graph"]
 
@@ -104,6 +106,20 @@ def is_known(device: torch.device) -> bool:
 def verdict_of(device: torch.device, precision: Precision, model: Network) -> Verdict | None:
     """What is kept of this GPU as it is now; None for a known one, and where nobody has qualified it yet."""
     return None if is_known(device) else kept(device, precision, model)
+
+
+def unqualified(device: torch.device, precision: Precision, model: Network) -> str | None:
+    """Why one of `UNTRIED` doesn't run here before the machine is qualified for it; None: it does."""
+    if precision not in UNTRIED or under_test is not None or device.type != "cuda":
+        return None
+    verdict = kept(device, precision, model)
+    if verdict is not None and verdict.taken == "fused" and not (verdict.unfinished or verdict.failed):
+        return None
+    tried = "" if verdict is None else f"; here: {verdict.summary}"
+    return (
+        f"none of Turbo-Pi's own tests ran on a GPU that has {precision}, so it is refused until "
+        f"`turbopi doctor --qualify --checkpoint CKPT --precision {precision}` has found it right{tried}"
+    )
 
 
 def excluded(device: torch.device, precision: Precision, model: Network) -> Mapping[str, str]:

@@ -16,6 +16,7 @@ _DTYPES = {
     "fp8-mlp": torch.float8_e4m3fn,
     "fp8-f16sums": torch.float8_e4m3fn,
     "int8": torch.int8,
+    "nvfp4": torch.float8_e4m3fn,  # half of its own rate or less: PyTorch has no product in it for every such GPU
 }
 
 

@@ -1,4 +1,4 @@
-"""FP8 and INT8 on real observations: which numbers a policy's products see, and what rounding them does to its actions.
+"""FP8, INT8, NVFP4 on real observations: which numbers a policy's products see, and what that does to its actions.
 
     turbopi calibrate CKPT --observations RECORDING --out FILE     run.py      docs/quantization.md
 

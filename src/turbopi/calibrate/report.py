@@ -70,6 +70,20 @@ class Int8HeldOut(Struct, frozen=True):
         return _errors(self)
 
 
+class Nvfp4HeldOut(Struct, frozen=True):
+    """The same of NVFP4, which the expert hasn't."""
+
+    nvfp4: ActionsError
+    vision: ActionsError = field(name="nvfp4 in the vision alone")
+    prefix: ActionsError = field(name="nvfp4 in the prefix alone")
+    bf16: ActionsError
+    nvfp4_against_bf16: ActionsError = field(name="nvfp4 against bf16")
+    worst: WorstCall
+
+    def errors(self) -> dict[str, ActionsError]:
+        return _errors(self)
+
+
 def _errors(held_out: Struct) -> dict[str, ActionsError]:
     names = zip(held_out.__struct_fields__, held_out.__struct_encode_fields__, strict=True)
     found = {name: getattr(held_out, own) for own, name in names if own != "worst"}
@@ -109,11 +123,23 @@ class Int8CalibrationReport(CalibrationReport, frozen=True):
     held_out: Int8HeldOut  # type: ignore[assignment]
 
 
+class Nvfp4CalibrationReport(CalibrationReport, frozen=True):
+    """The same of NVFP4."""
+
+    held_out: Nvfp4HeldOut  # type: ignore[assignment]
+
+
+_REPORTS: Mapping[Numbers, type[CalibrationReport]] = {
+    "fp8": CalibrationReport,
+    "int8": Int8CalibrationReport,
+    "nvfp4": Nvfp4CalibrationReport,
+}
+
+
 def read_report(
     report: Mapping[str, object], numbers: Numbers = "fp8", source: object = "the calibration's report"
 ) -> CalibrationReport:
     """Of `Quantization.report`, whose `numbers` say of what. Raises CalibrationError for a report that today's
     `turbopi calibrate` doesn't write.
     """
-    kind = Int8CalibrationReport if numbers == "int8" else CalibrationReport
-    return as_document(report, kind, source, CalibrationError)
+    return as_document(report, _REPORTS[numbers], source, CalibrationError)

@@ -411,7 +411,8 @@ def _held_out(
     if name == "fp8":
         cases[HALF_SUMS] = used
         cases["fp8-mlp"] = {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"}
-    cases |= {f"{name} in the {part} alone": {s: used[s] for s in used if s.part == part} for part in PARTS}
+    for part in trials.format.parts:
+        cases[f"{name} in the {part} alone"] = {s: used[s] for s in used if s.part == part}
     progress.begin("held-out observations", len(cases) + 1)
     report: dict[str, Any] = {}
     actions = {}

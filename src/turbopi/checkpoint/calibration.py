@@ -14,7 +14,7 @@ from turbopi.support.errors import ConfigError
 logger = logging.getLogger(__name__)
 
 # in a checkpoint's folder: found there unless another file is named
-BESIDE: dict[Numbers, str] = {"fp8": "turbopi_fp8.json", "int8": "turbopi_int8.json"}
+BESIDE: dict[Numbers, str] = {"fp8": "turbopi_fp8.json", "int8": "turbopi_int8.json", "nvfp4": "turbopi_nvfp4.json"}
 
 
 def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:

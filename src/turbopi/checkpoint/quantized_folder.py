@@ -28,9 +28,9 @@ from turbopi.checkpoint.torch_files import Stored, read_header, read_tensor
 from turbopi.config import ModelConfig
 from turbopi.models import family_of, parameter_shapes
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.formats import FORMATS
+from turbopi.quantization.formats import OF_EIGHT_BITS
 from turbopi.quantization.fp8 import ScaledMatrix
-from turbopi.quantization.plan import TIERS, PrecisionPlan, Tier, format_of
+from turbopi.quantization.plan import KEPT_TIERS, PrecisionPlan, Tier, format_of
 from turbopi.quantization.sites import KINDS
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import Fields, one_line, read_json, shown
@@ -189,8 +189,8 @@ def _read_manifest(file: Path) -> tuple[dict[str, Any], ModelConfig]:
             f"{file} has version {version} of {FORMAT}, this Turbo-Pi reads version {VERSION}: convert the checkpoint "
             "that it was made from anew"
         )
-    format = format_of(fields.choice("precision", TIERS))
-    fields.choice("calibration_file", tuple(f"turbopi_{name}.json" for name in FORMATS))
+    format = format_of(fields.choice("precision", KEPT_TIERS))
+    fields.choice("calibration_file", tuple(f"turbopi_{name}.json" for name in OF_EIGHT_BITS))
     if manifest["calibration_file"] != f"turbopi_{format.name}.json":
         fields.refuse("calibration_file", f"turbopi_{format.name}.json")
     for name in ("weights_sha256", "file_sha256", "calibration", "rounded_on"):

@@ -20,7 +20,7 @@ PrecisionOption = Annotated[
     str | None,
     typer.Option(
         "--precision",
-        metavar="bf16|f32|int8-weights|fp8|fp8-mlp|fp8-f16sums|int8",
+        metavar="bf16|f32|int8-weights|fp8|fp8-mlp|fp8-f16sums|int8|nvfp4",
         help="Say what auto takes in this one; else in bf16, or what the folder's weights are in.",
     ),
 ]

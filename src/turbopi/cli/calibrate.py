@@ -1,4 +1,4 @@
-"""`turbopi calibrate`: FP8 or INT8 scales for one's own checkpoint, from one's own observations."""
+"""`turbopi calibrate`: FP8, INT8 or NVFP4 scales for one's own checkpoint, from one's own observations."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,7 +35,9 @@ def calibrate(
     precision: Annotated[
         str,
         typer.Option(
-            "--precision", metavar="fp8|int8", help="int8: for compute capability 8.0-8.7; also for 8.9, 9.0, 12.x."
+            "--precision",
+            metavar="fp8|int8|nvfp4",
+            help="int8: for compute capability 8.0-8.7; also for 8.9, 9.0, 12.x. nvfp4: for 10.x, 11.0, 12.x.",
         ),
     ] = "fp8",
     observations: Annotated[
@@ -54,7 +56,7 @@ def calibrate(
             "-o",
             metavar="FILE",
             help="Where the calibration is written.",
-            show_default="turbopi_fp8.json or turbopi_int8.json beside the weights",
+            show_default="turbopi_fp8.json, or _int8, _nvfp4, beside the weights",
         ),
     ] = None,
     count: Annotated[
@@ -92,11 +94,11 @@ def calibrate(
     tokenizer: Annotated[str | None, typer.Option("--tokenizer", metavar="FILE", help="SentencePiece model.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Prepare a checkpoint for FP8 or INT8: scales of every activation, and which matmuls had better stay in bf16.
+    """Prepare a checkpoint for FP8, INT8 or NVFP4: scales of activations, and which matmuls had better stay in bf16.
 
     Runs the float32 policy on your observations over all denoising steps, tries several ways to choose scales, and
     measures the error of the actions on observations that were held out. The file that it writes holds for these
-    weights and this precision alone. No hardware with FP8 or INT8 is needed.
+    weights and this precision alone. No hardware with such numbers is needed.
     """
     output = Output(as_json)
     from turbopi.quantization.formats import FORMATS

@@ -385,14 +385,14 @@ def convert(
 def _writer(precision: str, quantization: Path | None, device: str | None) -> Callable[..., Path]:
     """What writes an opened checkpoint to a folder. Raises ConfigError for options of another precision."""
     from turbopi.checkpoint.convert import DTYPES, convert
-    from turbopi.quantization.plan import TIERS
+    from turbopi.quantization.plan import KEPT_TIERS
 
-    if precision not in (*DTYPES, *TIERS):
-        raise ConfigError(f"--precision is {precision!r}; expected one of {', '.join((*DTYPES, *TIERS))}")
-    if precision not in TIERS:
+    if precision not in (*DTYPES, *KEPT_TIERS):
+        raise ConfigError(f"--precision is {precision!r}; expected one of {', '.join((*DTYPES, *KEPT_TIERS))}")
+    if precision not in KEPT_TIERS:
         given = {"--quantization": quantization, "--device": device}
         if extra := [name for name, value in given.items() if value is not None]:
-            raise ConfigError(f"{' and '.join(extra)} only applies to --precision {', '.join(TIERS)}")
+            raise ConfigError(f"{' and '.join(extra)} only applies to --precision {', '.join(KEPT_TIERS)}")
         return partial(convert, precision=precision)  # type: ignore[arg-type]
     from turbopi.backends import resolve_device
     from turbopi.checkpoint.calibration import for_policy

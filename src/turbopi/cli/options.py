@@ -223,7 +223,7 @@ class PolicyOptions(RobotOptions):
             panel=_RUNNING,
             metavar="NAME",
             help="bf16 as openpi serves it, f32, int8-weights (Pi0-FAST), or calibrated: fp8, fp8-mlp, fp8-f16sums, "
-            "int8. Unless given, the folder's own, else bf16, or what --backend has instead.",
+            "int8, nvfp4. Unless given, the folder's own, else bf16, or what --backend has instead.",
         ),
     ] = None
     quantization: Annotated[
@@ -232,7 +232,7 @@ class PolicyOptions(RobotOptions):
             "--quantization",
             panel=_RUNNING,
             metavar="FILE",
-            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json or turbopi_int8.json beside the "
+            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json, or _int8, _nvfp4, beside the "
             "weights.",
         ),
     ] = None

@@ -1,7 +1,7 @@
 """The reference with its sites rounded: plain PyTorch, float32 between the roundings, exact in what is rounded.
 
-The oracle of the engine's FP8 and INT8, and the instrument that says what they do to a checkpoint's actions, on any
-device.
+The oracle of the engine's FP8, INT8 and NVFP4, and the instrument that says what they do to a checkpoint's actions, on
+any device.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,11 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.quantize import rounded_matrix
 from turbopi.models.pi0.layers import AdaRMSNorm, inverse_rms
 from turbopi.models.pi0.reference import Pi0Model
 from turbopi.models.pi0.sites import linears, norm_of
-from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.formats import FP8, Format, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.sites import Site
 
@@ -31,12 +31,12 @@ def round_activation(x: Tensor, scale: float, format: Format = FP8) -> Tensor:
 
 
 def round_weight(weight: Tensor, directions: Directions | None = None, format: Format = FP8) -> Tensor:
-    """A matrix [out, in] as such numbers with a scale an output channel hold it, in its dtype."""
-    return quantize(weight, 1.0, directions, format).dequantized().to(weight.dtype)
+    """A matrix [out, in] as such numbers with scales from its own values hold it, in its dtype."""
+    return rounded_matrix(weight, 1.0, directions, format).dequantized().to(weight.dtype)
 
 
 class RoundedWeights:
-    """A model's matrices in eight bits, each rounded when it is first needed and then cached, a byte a weight.
+    """A model's matrices in eight bits or four, each rounded when it is first needed and then cached.
 
     directions  of the sites that have them
     """
@@ -44,17 +44,19 @@ class RoundedWeights:
     def __init__(self, directions: Mapping[Site, Directions] | None = None, format: Format = FP8) -> None:
         self.format = format
         self._directions = directions or {}
-        self._rounded: dict[int, tuple[Tensor, ScaledMatrix]] = {}  # with the weight: its id stays its own
+        self._rounded: dict[int, tuple[Tensor, RoundedMatrix]] = {}  # with the weight: its id stays its own
 
     def __call__(self, site: Site, weight: Tensor) -> Tensor:
         if id(weight) not in self._rounded:
-            self._rounded[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site), self.format)
+            self._rounded[id(weight)] = weight, rounded_matrix(weight, 1.0, self._directions.get(site), self.format)
         return self._rounded[id(weight)][1].dequantized().to(weight.dtype)
 
     def in_half_sums(self, site: Site, scale: float, weight: Tensor) -> ScaledMatrix:
         """The same, for an input's numbers with this scale."""
         self(site, weight)
-        return self._rounded[id(weight)][1].for_input(scale).for_half_sums()
+        made = self._rounded[id(weight)][1]
+        assert isinstance(made, ScaledMatrix), "float16 sums are FP8's"
+        return made.for_input(scale).for_half_sums()
 
 
 @contextmanager

@@ -11,7 +11,9 @@ ever holds more than a few of them in bfloat16.
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +22,12 @@ from turbopi.checkpoint.matrices import GATE_UP, QKV, is_used, matrix_names, nam
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
 from turbopi.models import family_of, parameter_shapes
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix, whole_lines
+from turbopi.quantization.formats import RoundedMatrix
+from turbopi.quantization.fp8 import ScaledMatrix, whole_lines
 from turbopi.quantization.sites import KINDS, Part
 
-MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
+AnyMatrix = Tensor | RoundedMatrix
+MakeMatrix = Callable[[str, Tensor], AnyMatrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
 HOST = torch.device("cpu")
 _PART = re.compile(rf"(.*\.)({'|'.join((*QKV, *GATE_UP))})(\.weight|\.bias)")
 
@@ -55,7 +59,7 @@ class WeightPlacement:
         precision: str | None = None,
     ) -> None:
         self.device, self.precision = device, precision
-        self.made, self.kept = dict[str, Matrix](), dict[str, ScaledMatrix]()
+        self.made, self.kept = dict[str, AnyMatrix](), dict[str, ScaledMatrix]()
         self._config, self._on_host, self._make, self._shapes = config, on_host, make, parameter_shapes(config)
         self._parts: dict[tuple[str, ...], dict[str, Tensor]] = {}  # of what is joined, those not yet given away
         self._places: dict[str, str] = {}  # of what is made, by the names of its parameters
@@ -114,7 +118,7 @@ class WeightPlacement:
         self.kept[place] = matrix
 
 
-def in_whole_lines(fc1: Matrix, fc2: Matrix) -> tuple[Matrix, Matrix]:
+def in_whole_lines(fc1: AnyMatrix, fc2: AnyMatrix) -> tuple[Any, Any]:
     """Both as they are; if both are in eight bits, with hidden columns of zeros up to whole lines of memory.
 
     With SigLIP's 4,304 hidden columns seven rows of fc2 in eight begin inside a line, and fc2 takes 1.05 to 1.4 times
@@ -125,6 +129,15 @@ def in_whole_lines(fc1: Matrix, fc2: Matrix) -> tuple[Matrix, Matrix]:
     if not (isinstance(fc1, ScaledMatrix) and isinstance(fc2, ScaledMatrix)) or wide == hidden:
         return fc1, fc2
     return fc1.padded(wide, inner), fc2.padded(fc2.shape[0], wide)
+
+
+def rows_of_parts(config: ModelConfig, place: str) -> list[int]:
+    """Of the matrix at a place, such as "prefix.0.qkv": the rows of each tensor that it is joined of."""
+    shapes = _shapes(config)
+    return [shapes[name][0] for name in names_at(place)]
+
+
+_shapes = cache(parameter_shapes)
 
 
 def joined_with(name: str) -> tuple[str, ...] | None:

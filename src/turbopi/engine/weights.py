@@ -18,7 +18,7 @@ from torch import Tensor
 from turbopi.checkpoint.matrices import QKV, is_used, matrix_names
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
-from turbopi.engine.weight_placement import MakeMatrix, in_whole_lines, is_conditioning, join
+from turbopi.engine.weight_placement import AnyMatrix, MakeMatrix, in_whole_lines, is_conditioning, join
 from turbopi.kernels.interface import Affine, GemmaLayer, State, VisionLayer
 from turbopi.models import family_of
 from turbopi.models.pi0.denoise import time_embedding, time_grid
@@ -55,7 +55,7 @@ class _Tensors:
         state: State,
         device: torch.device | None,
         make: MakeMatrix = _as_it_is,
-        made: dict[str, Matrix] | None = None,
+        made: dict[str, AnyMatrix] | None = None,
     ) -> None:
         self._state, self._device, self._make, self._made = state, device, make, made or {}
 
@@ -90,7 +90,7 @@ def pack(
     state: State,
     make: MakeMatrix = _as_it_is,
     *,
-    made: dict[str, Matrix] | None = None,
+    made: dict[str, AnyMatrix] | None = None,
     device: torch.device | None = None,
     expert_device: torch.device | None = None,
 ) -> Weights:

@@ -11,6 +11,7 @@ from torch import Tensor
 from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN
+from turbopi.kernels.portable.nvfp4 import in_nvfp4
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops, in_int8
 from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
@@ -64,6 +65,8 @@ def fused_ops(
     ops = ops_of("hopper" if on_hopper else "portable", device, tiles)
     if on_hopper and precision == "int8":
         ops = in_int8(ops)
+    if precision == "nvfp4":
+        ops = in_nvfp4(ops)
     instead: dict[str, Any] = {one.name: getattr(BESIDE, one.name) for one in fields(Ops) if one.name in without}
     if not instead:
         return ops

@@ -19,7 +19,7 @@ from torch import Tensor
 from turbopi.kernels.interface import PILLOW_BITS, Ops, Taps
 from turbopi.models.pi0.layers import apply_rope, rms_normalize
 from turbopi.models.pi0.vision import normalize_images
-from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, Matrix, to_e4m3
 from turbopi.quantization.int8 import mark_damage, to_int8
 
 
@@ -125,7 +125,7 @@ def residual_layer_norm(
 
 def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
     """x @ weightᵀ + bias, into `out` if it is given."""
-    result = weight.product(x, bias).to(weight.dtype) if isinstance(weight, ScaledMatrix) else F.linear(x, weight, bias)
+    result = F.linear(x, weight, bias) if isinstance(weight, Tensor) else weight.product(x, bias).to(weight.dtype)
     return result if out is None else out.copy_(result)
 
 
@@ -137,8 +137,8 @@ def linear_gelu(
     numbers: torch.dtype = E4M3,
     stream: Tensor | None = None,
 ) -> Tensor:
-    """gelu(x @ weightᵀ + bias). A ScaledMatrix's product isn't rounded before."""
-    if not isinstance(weight, ScaledMatrix):
+    """gelu(x @ weightᵀ + bias). A rounded matrix's product isn't rounded before."""
+    if isinstance(weight, Tensor):
         return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse, numbers, stream)
     return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse, numbers, stream)
 
@@ -151,7 +151,7 @@ def linear_geglu(
     stream: Tensor | None = None,
 ) -> Tensor:
     """[tokens, D] times [2F, D], gate rows before up rows -> gelu(gate) * up [tokens, F]."""
-    if not isinstance(gate_up, ScaledMatrix):
+    if isinstance(gate_up, Tensor):
         return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse, numbers, stream)
     return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse, numbers, stream)
 

@@ -19,7 +19,7 @@ from turbopi.models.pi0.sample import Sample
 from turbopi.policy.history import History
 from turbopi.preprocess.pipeline import Incoming, Pipeline
 from turbopi.preprocess.text_prompts import joint_ids, text_ids, text_of
-from turbopi.quantization.plan import EIGHT_BITS
+from turbopi.quantization.plan import ROUNDED
 from turbopi.realtime.messages import MAX_TEXT
 from turbopi.support.errors import ObservationError
 
@@ -96,7 +96,7 @@ class TextCalls:
     @property
     def _in_bf16(self) -> str:
         """What else is to be given where no backend that writes has the precision."""
-        return " with precision 'bf16'" * (self._backend.precision in EIGHT_BITS)
+        return " with precision 'bf16'" * (self._backend.precision in ROUNDED)
 
     def write(self, seen: Incoming, inputs: ModelInputs, prompt: str | None, most: int | None) -> str:
         """What it says to one observation. prompt: in place of the observation's."""

@@ -26,6 +26,7 @@ from turbopi.models.observation import ModelInputs, Observation
 from turbopi.policy import shipped
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import tokenizer_of
+from turbopi.qualify.four_bits import OPERATIONS, check_four_bits
 from turbopi.qualify.operations import AHEAD, COMPILING, At, Comparison
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, shapes_of
 from turbopi.quantization.plan import TIERS, Precision, format_of
@@ -42,7 +43,7 @@ LAYERS = 4  # of the model's: more than vision's head, which a graph of its own 
 OBSERVATIONS, NOISES = 4, 2
 BATCH = 2
 # Of a batch's actions against single calls', relative rms: either rounds by itself, to 0.02 with such weights
-BATCH_BOUND, EIGHT_BITS_BATCH_BOUND = 0.06, 0.12
+BATCH_BOUND, EIGHT_BITS_BATCH_BOUND, FOUR_BITS_BATCH_BOUND = 0.06, 0.12, 0.3
 MARGIN = 0.01  # of the time of `cuda_graph`: less is noise
 RACE_TURNS, CALLS = 5, 9  # of each backend, and calls of a turn, beside those that warm it
 PARTS = ("total", "vision", "prefix", "denoise")  # of a call's time
@@ -158,7 +159,12 @@ def check_grid(subject: Subject) -> Figures:
 
 
 def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quantization | None) -> Comparison:
-    """Every operation of a call beside PyTorch's, then a batch beside its single calls."""
+    """Every operation of a call beside PyTorch's, then a batch beside its single calls; before them NVFP4's kernels."""
+    if subject.precision == "nvfp4":
+        subject.at("products in NVFP4", "", COMPILING)
+        why, _ = check_four_bits(subject.device)
+        if why is not None:
+            raise Faulty(why)
     cls = backends.class_for(subject.name, subject.model)
     compared = Comparison(subject.device, subject.at, ahead=AHEAD not in subject.excluded)
 
@@ -187,9 +193,17 @@ def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quanti
         compared.compares = False  # rows of a batch's padding may be anything
         subject.at("a batch of two", "batch", COMPILING)
         together = backend.sample(Observation.stack(inputs), noise, steps)
-        _check_batch(together, alone, EIGHT_BITS_BATCH_BOUND if subject.precision in TIERS else BATCH_BOUND)
+        _check_batch(together, alone, _batch_bound(subject.precision))
     subject.at("kernels", "", COMPILING)
+    if subject.precision == "nvfp4" and (wrong := compared.failed.keys() & set(OPERATIONS)):
+        raise Faulty("; ".join(f"{name}, beside PyTorch's, {compared.failed[name]}" for name in sorted(wrong)))
     return compared
+
+
+def _batch_bound(precision: Precision) -> float:
+    if precision == "nvfp4":
+        return FOUR_BITS_BATCH_BOUND
+    return EIGHT_BITS_BATCH_BOUND if precision in TIERS else BATCH_BOUND
 
 
 def _check_batch(together: Sample, alone: list[Sample], bound: float) -> None:

@@ -1,4 +1,4 @@
-"""What calibration leaves behind: one JSON file that says which products run in FP8 or INT8, with which scales, why.
+"""What calibration leaves behind: one JSON file that says which products run in FP8, INT8 or NVFP4, with what scales.
 
 It holds for one set of weights (by the hash of all of them), one model and one version of this format; everything else
 is refused. What was measured to get there is kept in it and goes with it into every policy's metadata.
@@ -34,8 +34,8 @@ RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by
 class SiteScale:
     """A site's share of the file.
 
-    scale       of its activation: x ≈ e4m3 or int8 * scale; 1 where it isn't rounded; None for the expert's in files of
-                versions 1 and 2
+    scale       of its activation: x ≈ e4m3 or int8 * scale, in NVFP4 the tensor's; 1 where it isn't rounded; None for
+                the expert's in files of versions 1 and 2
     largest     |x| seen in calibration
     saturated   part of the held-out values beyond the largest number
     error       relative rms of its products on the calls that sites are chosen on, rounded against not
@@ -93,7 +93,7 @@ class SiteScale:
 
 @dataclass(frozen=True)
 class Quantization:
-    """A calibrated checkpoint's FP8 or INT8: read with `load`, checked with `check`, narrowed with `only`."""
+    """A calibrated checkpoint's FP8, INT8 or NVFP4: read with `load`, checked with `check`, narrowed with `only`."""
 
     fingerprint: str
     shapes: Mapping[str, Any]

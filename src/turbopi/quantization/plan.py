@@ -9,19 +9,20 @@ from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, Site
 
 # that a policy runs in; the tiers need a calibration, and weights in INT8 beside activations that aren't rounded none
-Precision = Literal["bf16", "f32", "int8-weights", "fp8", "fp8-mlp", "fp8-f16sums", "int8"]
+Precision = Literal["bf16", "f32", "int8-weights", "fp8", "fp8-mlp", "fp8-f16sums", "int8", "nvfp4"]
 Fp8Tier = Literal["fp8", "fp8-mlp", "fp8-f16sums"]
 FP8_TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
-Tier = Literal["fp8", "fp8-mlp", "fp8-f16sums", "int8"]
+Tier = Literal["fp8", "fp8-mlp", "fp8-f16sums", "int8", "nvfp4"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
+KEPT_TIERS: tuple[Tier, ...] = (*FP8_TIERS, "int8")  # that a folder keeps its weights in
 WEIGHTS_ALONE: Final = "int8-weights"
 HALF_SUMS: Final = "fp8-f16sums"  # FP8 whose products of vision and prefix are added up in float16: see fp8.py
-EIGHT_BITS: tuple[Precision, ...] = (WEIGHTS_ALONE, *TIERS)
+ROUNDED: tuple[Precision, ...] = (WEIGHTS_ALONE, *TIERS)
 
 
 def format_of(tier: str) -> Format:
     """What a tier's numbers are."""
-    return FORMATS["int8" if tier == "int8" else "fp8"]
+    return next((one for one in FORMATS.values() if one.name == tier), FORMATS["fp8"])
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class PrecisionPlan:
     @property
     def expert(self) -> Literal["fp8", "int8", "bf16"]:
         """The denoising kernel takes all of the expert's matrices in one precision: bf16 if any is to be kept so."""
-        return "bf16" if any(name.startswith("expert.") for name in self.kept) else self.format.name
+        name = self.format.name
+        return "bf16" if name == "nvfp4" or any(one.startswith("expert.") for one in self.kept) else name
 
     @property
     def half_sums(self) -> bool:
@@ -86,6 +88,8 @@ def refusal(site: Site, format: Format) -> str | None:
     """Why a site can't be in a format, whatever its calibration says, or None."""
     if site.last and not format.holds_nan:
         return f"{format.label} has no NaN, and a NaN of the prefix reaches the actions through these keys and values"
+    if site.part not in format.parts:
+        return f"{format.label} is for {' and '.join(format.parts)}: no denoising kernel has it"
     return site.refusal
 
 

@@ -13,8 +13,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
+
+Rounded = Callable[[Tensor, float | Tensor], Tensor]  # (x, 1 / scale) -> x in a format's numbers
 
 
 def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
@@ -35,14 +36,14 @@ def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def round_with_feedback_plain(
-    weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor, format: Format = FP8
+    weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor, numbers: Rounded
 ) -> Tensor:
-    """A column at a time: what `kernels.portable.rounding.round_with_feedback` does."""
+    """A column at a time: what `kernels.portable.rounding.round_with_feedback` does. `numbers`: `Format.rounded`."""
     scale = 1 / inverse
     rounded = columns_with_feedback(
-        weight, order, errors, answers, lambda wanted, _: format.rounded(wanted, inverse).float() * scale
+        weight, order, errors, answers, lambda wanted, _: numbers(wanted, inverse).float() * scale
     )
-    return format.rounded(rounded, inverse[:, None])
+    return numbers(rounded, inverse[:, None])
 
 
 def columns_with_feedback(

@@ -17,10 +17,10 @@ since every way of adding up differs, and bugs are as much further off.
 """
 
 from turbopi.backends import Precision
-from turbopi.quantization.plan import EIGHT_BITS
+from turbopi.quantization.plan import ROUNDED
 
 # times the control (control.py), for actions in the model's units
-BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, **dict.fromkeys(EIGHT_BITS, 5.0)}
+BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, **dict.fromkeys(ROUNDED, 5.0)}
 TRAINED_FACTORS: dict[Precision, float] = BOUND_FACTORS | {"bf16": 10.0}
 
 # of `turbopi verify`
@@ -31,7 +31,7 @@ FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975
 FP8_COSINE = 0.9975  # of what denoising did (actions less noise): what calibration aims at
 # E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be. int8's is a dozen times as coarse
 # for a normal variable; with outliers, which its scale has to hold, more
-FP8_STEP = 2.0**5
+STEPS: dict[str, float] = {**dict.fromkeys(ROUNDED, 2.0**5), "nvfp4": 2.0**7}  # E2M1 has two bits less than E4M3
 SUSPECT_FACTOR = 3.0  # times the control's, on an intermediate
 JUMP = 10.0  # times the layer or step before
 FLOAT32_ROUNDING = 1e-6  # relative rms: where the control stays in float32 it may have no error at all

@@ -66,7 +66,10 @@ FLOAT32_ROUNDING = 1e-6  # relative rms
 FP8_COSINE = 0.9995  # of the actions
 FP8_BOUND = (1 - FP8_COSINE**2) ** 0.5  # relative rms: what that cosine allows
 FP8_TARGET = 0.9997  # asked of calibration, which aims at it with emulated float32 between the roundings
-GOLDEN_METHODS: dict[Numbers, tuple[Method, ...]] = {"fp8": ("headroom",), "int8": ("mse",)}  # how scales are chosen
+GOLDEN_METHODS: dict[Numbers, tuple[Method, ...]] = {
+    **dict.fromkeys(("fp8", "nvfp4"), ("headroom",)),
+    "int8": ("mse",),
+}  # how scales are chosen
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ import torch
 
 from turbopi.backends import Precision
 from turbopi.models import family_of
-from turbopi.quantization.plan import EIGHT_BITS
+from turbopi.quantization.plan import ROUNDED
+from turbopi.verify.bounds import STEPS
 
 CONTROL_SEEDS = (1, 2)
 # how much coarser than bfloat16's a precision's rounding is
-ROUNDING: dict[Precision, float] = {"bf16": 1.0, "f32": 2.0**-16, **dict.fromkeys(EIGHT_BITS, 2.0**5)}
+ROUNDING: dict[Precision, float] = {"bf16": 1.0, "f32": 2.0**-16, **{one: STEPS[one] for one in ROUNDED}}
 _HALF_BF16_STEP = 2.0**-9
 
 

@@ -8,7 +8,7 @@ from msgspec.structs import asdict
 
 from turbopi.engine.emulate import NO_SIGNAL, has_signal
 from turbopi.policy.examples import NoisyExample
-from turbopi.quantization.plan import EIGHT_BITS
+from turbopi.quantization.plan import ROUNDED
 from turbopi.support.action_groups import action_groups
 from turbopi.support.errors import BackendError, ConfigError
 from turbopi.support.text import significant
@@ -19,8 +19,8 @@ from turbopi.verify.bounds import (
     FLOAT32_ROUNDING,
     FP8_BOUND,
     FP8_COSINE,
-    FP8_STEP,
     JUMP,
+    STEPS,
     SUSPECT_FACTOR,
     TRAINED_FACTORS,
 )
@@ -76,7 +76,7 @@ class Rule:
             return cls(control, bound, factor, "given by the user", overridden=True)
         if precision == "f32":
             return cls(control, F32_BOUND, None, "two float32 implementations differ by less, TF32 by more")
-        if precision in EIGHT_BITS:
+        if precision in ROUNDED:
             reason = "a cosine of 0.9975 to float32, what calibration aims at"
             return cls(control, FP8_BOUND, None, reason, cosine=FP8_COSINE)
         if control == "jitter":
@@ -93,8 +93,8 @@ class Rule:
         """What an intermediate may be off before it is suspect."""
         if precision == "f32":
             return F32_BOUND if self.bound is None else self.bound
-        if precision in EIGHT_BITS:
-            return max(FP8_STEP * control, FLOAT32_ROUNDING)
+        if precision in ROUNDED:
+            return max(STEPS[precision] * control, FLOAT32_ROUNDING)
         return max(self.suspect_factor * control, FLOAT32_ROUNDING)
 
     @property
@@ -209,7 +209,7 @@ def judge(
             reason=rule.reason,
             deltas_cosine=rule.cosine,
             overridden=rule.overridden,
-            suspect_factor=None if precision == "f32" else FP8_STEP if precision in EIGHT_BITS else rule.suspect_factor,
+            suspect_factor=None if precision == "f32" else STEPS.get(precision, rule.suspect_factor),
             jump=JUMP,
         ),
         first_off=None if suspect is None else _suspect(suspect),

@@ -1,13 +1,29 @@
 """Weights to eight bits, by a kernel where there is a GPU with Triton. The plain way: `quantization.rounding`."""
 
 import importlib.util
+from collections.abc import Sequence
 
 from torch import Tensor
 
-from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.formats import FP8, NVFP4, Format, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, channel_scales
+from turbopi.quantization.nvfp4 import Nvfp4Matrix
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 from turbopi.support.toolchain import make_caches_writable
+
+
+def rounded_matrix(
+    weight: Matrix,
+    input_scale: float,
+    directions: Directions | None = None,
+    format: Format = FP8,
+    parts: Sequence[int] = (),
+) -> RoundedMatrix:
+    """weight [out, in] in any format, rounded for its input's directions. parts: see `Nvfp4Matrix.of`."""
+    if format is not NVFP4:
+        return quantize(weight, input_scale, directions, format)
+    assert isinstance(weight, Tensor), "no folder keeps four bits"
+    return Nvfp4Matrix.of(weight, input_scale, directions, parts)
 
 
 def quantize(
@@ -39,4 +55,4 @@ def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = 
         from turbopi.kernels.portable.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
         return round_with_feedback(weight, inverse, *feeding, format.dtype)
-    return round_with_feedback_plain(weight, inverse, *feeding, format)
+    return round_with_feedback_plain(weight, inverse, *feeding, format.rounded)

@@ -11,36 +11,16 @@ import turbopi.models.pi0.gemma
 import turbopi.models.pi0.vision
 from turbopi.models.pi0.layers import attention
 from turbopi.quantization.fp8 import E4M3_MAX, Directions, to_e4m3
+from turbopi.quantization.nvfp4 import BLOCK, block_scales, round_blocks, round_e2m1, tensor_scale
 from turbopi.quantization.rounding import columns_with_feedback, feedback
 
-# NVFP4 (Blackwell): E2M1 numbers in blocks of 16 with an E4M3 scale each, and one float32 scale for the tensor.
-E2M1 = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-BLOCK = 16
 MX_BLOCK = 32
-
-
-def round_e2m1(x: Tensor) -> Tensor:
-    """To the nearest of ±E2M1, halves to the one with an even mantissa, beyond 6 to 6."""
-    x = x.clamp(-E2M1[-1], E2M1[-1])
-    magnitude = x.abs()
-    step = torch.where(magnitude < 2, 0.5, torch.where(magnitude < 4, 1.0, 2.0))  # between E2M1's numbers
-    return torch.round(x / step) * step
-
-
-def round_nvfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
-    """x [rows, K] as NVFP4 holds it, K a multiple of 16; scales from its own values. With `directions` x is a weight,
-    rounded for them.
-    """
-    blocks = x.float().view(*x.shape[:-1], -1, BLOCK)
-    scale = _nvfp4_scales(blocks)
-    if scale is None:
-        return x
-    return _in_blocks(x, blocks, scale, directions)
 
 
 def round_mxfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
     """x [rows, K] as MXFP4 holds it (OCP's Microscaling Formats 1.0): E2M1 numbers in blocks of 32 whose scales are
-    powers of two; K a multiple of 32. It is what tensor cores can multiply with E4M3 numbers. `directions` as above.
+    powers of two; K a multiple of 32. It is what tensor cores can multiply with E4M3 numbers. `directions`: as of
+    `quantization.nvfp4.round_nvfp4`.
     """
     blocks = x.float().view(*x.shape[:-1], -1, MX_BLOCK)
     largest = blocks.abs().amax(-1, keepdim=True)
@@ -50,36 +30,28 @@ def round_mxfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
 
 def nvfp4_without_scales(x: Tensor) -> Tensor:
     """What a product sees if NVFP4's numbers are right, and their scales are ignored where they are read."""
-    blocks = x.float().view(*x.shape[:-1], -1, BLOCK)
-    scale = _nvfp4_scales(blocks)
-    return x if scale is None else round_e2m1(blocks / scale.clamp(min=1e-30)).flatten(-2).to(x.dtype)
+    scale = tensor_scale(x)
+    return x if scale == 0 else round_blocks(x, scale, block_scales(x, scale)).to(x.dtype)
 
 
 def nvfp4_with_swizzled_scales(x: Tensor) -> Tensor:
     """What a product sees if block scales lie in the order of rows, and are read in that of 128 × 4 tiles that tensor
     cores want: row r, block c of a tile at 16 (r mod 32) + 4 (r div 32) + c. Rows and blocks of whole tiles alone.
     """
-    blocks = x.float().view(*x.shape[:-1], -1, BLOCK)
-    scale = _nvfp4_scales(blocks)
-    if scale is None:
+    scale = tensor_scale(x)
+    if scale == 0:
         return x
-    codes = round_e2m1(blocks / scale.clamp(min=1e-30))
-    rows, columns = scale.shape[0] // 128 * 128, scale.shape[1] // 4 * 4
-    read = scale.clone()
+    blocks = block_scales(x, scale)
+    codes, by = round_blocks(x, scale, blocks).view(*blocks.shape, BLOCK), blocks.float() * scale
+    rows, columns = by.shape[0] // 128 * 128, by.shape[1] // 4 * 4
+    read = by.clone()
     if rows and columns:
-        tiles = scale[:rows, :columns, 0].reshape(rows // 128, 128, columns // 4, 4).transpose(1, 2).flatten(2)
+        tiles = by[:rows, :columns].reshape(rows // 128, 128, columns // 4, 4).transpose(1, 2).flatten(2)
         row, column = torch.arange(128)[:, None], torch.arange(4)[None]
         places = 16 * (row % 32) + 4 * (row // 32) + column
         mixed = tiles[..., places.to(x.device)]
-        read[:rows, :columns, 0] = mixed.transpose(1, 2).reshape(rows, columns)
-    return (codes * read).flatten(-2).to(x.dtype)
-
-
-def _nvfp4_scales(blocks: Tensor) -> Tensor | None:
-    """Of blocks [rows, K / 16, 16], with the tensor's: float32[rows, K / 16, 1]; None where everything is 0."""
-    largest = blocks.abs().amax(-1, keepdim=True)
-    whole = largest.max() / (E2M1[-1] * E4M3_MAX)
-    return None if whole == 0 else to_e4m3(largest / E2M1[-1], 1 / whole).float() * whole
+        read[:rows, :columns] = mixed.transpose(1, 2).reshape(rows, columns)
+    return (codes * read[..., None]).flatten(-2).to(x.dtype)
 
 
 def _in_blocks(x: Tensor, blocks: Tensor, scale: Tensor, directions: Directions | None) -> Tensor:

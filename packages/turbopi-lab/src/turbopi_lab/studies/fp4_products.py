@@ -11,14 +11,9 @@ from turbopi.config import preset
 from turbopi.models.pi0.reference import Pi0Model
 from turbopi.models.pi0.sites import linears
 from turbopi.quantization.fp8 import E4M3_MAX
+from turbopi.quantization.nvfp4 import round_e2m1, round_nvfp4
 from turbopi.quantization.sites import sites
-from turbopi_lab.studies.formats import (
-    nvfp4_with_swizzled_scales,
-    nvfp4_without_scales,
-    round_e2m1,
-    round_mxfp4,
-    round_nvfp4,
-)
+from turbopi_lab.studies.formats import nvfp4_with_swizzled_scales, nvfp4_without_scales, round_mxfp4
 from turbopi_lab.studies.report import Cell, Grid
 
 # Bytes a weight: NVFP4 has a byte of scale for 16 numbers, MXFP4 for 32; FP8 has a scale a channel, which is nothing

@@ -31,10 +31,11 @@ from turbopi.models.pi0.sites import linears
 from turbopi.policy import shipped
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.nvfp4 import round_nvfp4
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
 from turbopi.support.provenance import Provenance
 from turbopi.support.reading import plain_document
-from turbopi_lab.studies.formats import attention_in_fp8, nvfp4_without_scales, round_mxfp4, round_nvfp4
+from turbopi_lab.studies.formats import attention_in_fp8, nvfp4_without_scales, round_mxfp4
 from turbopi_lab.studies.fp4_products import (
     UNREAD,
     UNSCALED,

@@ -82,6 +82,14 @@ def int8_refusal(capability: Capability) -> str | None:
     return f"on compute capability 10.x and 11.0 Triton multiplies INT8 by mma.sync, which nobody timed there; {has}"
 
 
+def nvfp4_refusal(capability: Capability) -> str | None:
+    """Why this GPU can't multiply NVFP4; None if it can."""
+    if capability[0] in (10, 11, 12):
+        return None
+    has = f"this GPU has {capability[0]}.{capability[1]}"
+    return f"tensor cores multiply NVFP4 on compute capability 10.x, 11.0 and 12.x; {has}"
+
+
 def promotes(capability: Capability, inner: int) -> bool:
     """Whether sums over `inner` E4M3 products are added up in float32 after each step.
 
