@@ -742,20 +742,12 @@ def test_the_command_needs_a_place_to_write() -> None:
     assert "no weights" in refusal(turbopi("calibrate", "--out", "x.json"))
 
 
-@pytest.mark.parametrize(
-    ("name", "label", "instead"),
-    [
-        ("pi0_fast_base", "Pi0-FAST", "or on an NVIDIA GPU in 'int8-weights', which needs none"),
-        ("smolvla_base", "SmolVLA", "run it in precision 'bf16'"),
-    ],
-)
-def test_a_family_without_calibrations_is_refused_before_anything_is_asked_for(
-    name: str, label: str, instead: str
-) -> None:
-    said = refusal(turbopi("calibrate", "--random-weights", name))
-    assert f"calibrations are for Pi0 and Pi0.5 alone, and {name} is {label}" in said and said.endswith(instead)
+def test_a_family_without_calibrations_is_refused_before_anything_is_asked_for() -> None:
+    said = refusal(turbopi("calibrate", "--random-weights", "pi0_fast_base"))
+    assert "calibrations are for Pi0.5, Pi0, SmolVLA alone, and pi0_fast_base is Pi0-FAST" in said
+    assert said.endswith("or on an NVIDIA GPU in 'int8-weights', which needs none")
     with pytest.raises(ConfigError, match="calibrations are for Pi0"):
-        run.calibrate(random_checkpoint(name), Settings({"robot": "droid"}))
+        run.calibrate(random_checkpoint("pi0_fast_base"), Settings({"robot": "droid"}))
 
 
 def test_parts_narrow_a_named_calibration_alone(tmp_path: Path) -> None:

@@ -13,11 +13,15 @@ from smolvla_golden import relative
 from test_kernels_portable_denoise_emulated import Emulated
 from torch import Tensor
 
+from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.engine.smolvla import Expert
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.smolvla.config import SmolVLAConfig, TextConfig
 from turbopi.models.smolvla.reference import SmolVLAModel
+from turbopi.quantization.formats import INT8
+from turbopi.quantization.plan import PrecisionPlan
+from turbopi.quantization.sites import sites
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")]
 CPU = torch.device("cpu")
@@ -56,6 +60,7 @@ def run(
     *,
     before: Tensor | None = None,
     seed: int = 0,
+    plan: PrecisionPlan | None = None,
 ) -> Tensor:
     def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
         assert choice is None or sizes["TP_ACROSS_AT_ONCE"] == choice.across_at_once
@@ -65,7 +70,7 @@ def run(
     monkeypatch.setattr(denoise, "unavailable", lambda device, weights: None)
     monkeypatch.setattr(denoise, "has_large_l2", lambda device: True)
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
-    expert = Expert.pack(made)
+    expert = Expert.pack(made, plan)
     of_expert = [(kept.k[i], kept.v[i]) for i in made.config.expert_at]
     crossed = made.cross_keys_values(kept)
     given = [own if other is None else other for own, other in zip(of_expert, crossed, strict=True)]
@@ -91,6 +96,9 @@ def run(
         ({"self_every": 2, "expert_depth": 4}, 10, 200, 13, denoise.IN_RANGES),  # a block has nothing across
         ({"self_every": 0, "expert_depth": 4}, 17, 30, 18, FOUR_WARPS),
         ({"self_every": 3, "expert_depth": 4}, 8, 30, 6, FOUR_WARPS),
+        ({"self_every": 2, "expert_depth": 4, "int8": True}, 10, 21, 3, None),
+        ({"self_every": 0, "expert_depth": 4, "int8": True}, 17, 30, 18, FOUR_WARPS),
+        ({"self_every": 3, "expert_depth": 4, "int8": True}, 10, 200, 13, denoise.IN_RANGES),
     ],
 )
 def test_the_loop_is_as_exact_as_ordinary_bf16(
@@ -102,16 +110,22 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
     blocks: int,
     choice: denoise.Choices | None,
 ) -> None:
-    steps, made = 2, model(1, **sizes)
+    """With int8: of weights that are rounded, but for the matrix that mixes in the time."""
+    steps, int8 = 2, "int8" in sizes
+    made = model(1, **{name: size for name, size in sizes.items() if name != "int8"})
     kept = cache(made, length + 9, length)
     noise = torch.randn(suffix, 16, generator=torch.Generator().manual_seed(3))
-    exact = made.denoise(kept, noise[None], steps)[0]
+    scales = {site: 1.0 for site in sites(made.config) if int8 and site.part == "expert"}
+    plan = PrecisionPlan("int8", {str(site): 1.0 for site in scales}, {}, {}) if int8 else None
+    plain = made.denoise(kept, noise[None], steps)[0]
+    with rounded(made, scales, RoundedWeights(format=INT8)):
+        exact = made.denoise(kept, noise[None], steps)[0]
+    assert torch.equal(exact, plain) != int8
     ordinary = copy.deepcopy(made)
     ordinary.expert.bfloat16()
-    ours = run(made, kept, noise, steps, monkeypatch, tmp_path, blocks, choice)
-    error, usual = (
-        relative(one.numpy(), exact.numpy()) for one in (ours, ordinary.denoise(kept, noise[None], steps)[0])
-    )
+    ours = run(made, kept, noise, steps, monkeypatch, tmp_path, blocks, choice, plan=plan)
+    usual = relative(ordinary.denoise(kept, noise[None], steps)[0].numpy(), plain.numpy())
+    error = relative(ours.numpy(), exact.numpy())
     assert 0 < error <= 1.1 * usual, (error, usual)
 
 

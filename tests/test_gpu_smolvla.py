@@ -1,19 +1,27 @@
 """SmolVLA on a GPU: backend `cuda_graph` gives LeRobot's actions, `fused` what the reference does."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from smolvla_golden import GoldenRuns, make_checkpoint, make_hub
+from test_gpu_int8 import is_as_far_off
+from torch import Tensor
 
 from turbopi import UnifiedPolicy
 from turbopi.backends.base import StageTimer
 from turbopi.backends.captured import CapturedBackend
+from turbopi.backends.pytorch import reference_model
+from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
+from turbopi.engine.emulate import RoundedWeights, relative_rms, rounded
 from turbopi.models.observation import Observation, Past
 from turbopi.models.pi0.conditioning import Conditioning, Guidance
+from turbopi.quantization.formats import FORMATS
+from turbopi.quantization.sites import sites
 from turbopi.support.errors import ObservationError
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("default")]  # Inductor warns of what it does
@@ -219,3 +227,88 @@ def test_a_fused_batch_of_other_prompts_and_cameras_is_as_near(policies: dict[st
                 assert 0 < relative(ours, right) <= 1.5 * relative(usual, right)
     sizes = policies["fused"].metadata["backend_details"]["batches"]
     assert sizes == ["2 observations with up to 3 cameras", "4 observations with up to 3 cameras"]
+
+
+# -- FP8 and INT8 ------------------------------------------------------------------------------------------------------
+
+HERE = torch.cuda.get_device_capability() if torch.cuda.is_available() else (0, 0)
+EIGHT_BITS = [
+    pytest.param("int8", marks=pytest.mark.skipif(HERE[0] in (10, 11), reason="this GPU refuses INT8")),
+    pytest.param("fp8", marks=pytest.mark.skipif(HERE < (8, 9), reason="this GPU has no FP8")),
+]
+
+
+@pytest.fixture(scope="module", params=EIGHT_BITS)
+def calibrated(request: pytest.FixtureRequest, published: Checkpoint, policies: dict[str, UnifiedPolicy]) -> Any:
+    """(calibration, three observations of two, one and two cameras, noise, float32's actions, those of float32 with
+    rounded sites, by whether the expert's are).
+    """
+    format, device = FORMATS[request.param], torch.device("cuda", 0)
+    given: Any = {"count": 4, "target": 0.0, "methods": ("max",), "format": format}
+    calibration = calibrate(published, Settings({"device": device}, "random-noise", **given))
+    model: Any = reference_model(policies["exact"].backend)
+    plan = calibration.plan(model.config, format.name)
+    prompts = ["a", "put the red cup on the plate " * 3, "open it"]
+    inputs = [
+        policies["exact"].prepare(seen(policies["exact"], 3 + i, 2 - i % 2, one)) for i, one in enumerate(prompts)
+    ]
+    several, noise = Observation.stack(inputs), torch.randn(3, 50, 32, generator=torch.Generator().manual_seed(2))
+
+    def actions() -> Tensor:
+        rows = [model.sample(several.row(i).to(device), noise[i : i + 1].to(device), 10) for i in range(3)]
+        return torch.cat(rows).cpu()
+
+    exact, emulated = actions(), {}
+    for expert in (True, False):
+        used = {site: plan.scales[str(site)] for site in sites(model.config) if str(site) in plan.rounded}
+        used = {site: scale for site, scale in used.items() if expert or site.part != "expert"}
+        weights = RoundedWeights({site: plan.directions[str(site)] for site in used}, format)
+        with rounded(model, used, weights):
+            emulated[expert] = actions()
+    return calibration, several, noise, exact, emulated
+
+
+@pytest.fixture(scope="module", params=["auto", "portable"] if HERE == (9, 0) else ["auto"])
+def in_eight_bits(request: pytest.FixtureRequest, published: Checkpoint, calibrated: Any) -> Any:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("TURBOPI_KERNELS", request.param)
+        given: Any = {"precision": calibrated[0].numbers, "quantization": calibrated[0]}
+        return UnifiedPolicy(published, backend="fused", **given).backend
+
+
+def test_eight_bits_are_as_far_from_float32_as_their_emulation(in_eight_bits: Any, calibrated: Any) -> None:
+    """Alone, and in a batch, whose expert is in bfloat16."""
+    runner, (_, several, noise, exact, emulated) = in_eight_bits, calibrated
+    alone = [runner.sample(several.row(i), noise[i : i + 1], 10).actions.clone() for i in (0, 1, 2, 2)]
+    assert torch.equal(alone[2], alone.pop())
+    for in_kernel, ours in ((True, torch.cat(alone)), (False, runner.sample(several, noise, 10).actions)):
+        for row, right, expected in zip(ours, exact, emulated[in_kernel], strict=True):
+            print(f"{relative_rms(row, right):.4f} of float32, emulated {relative_rms(expected, right):.4f}")
+            assert is_as_far_off(row, right, expected)
+    plan = runner.describe()[runner.precision]["plan"]
+    assert plan["vision.fc1"] == plan["prefix.down"] == runner.precision
+    assert plan["expert"].startswith("int8" if runner.precision == "int8" else "bf16")
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_damage_in_eight_bits_harms_no_other_observation(in_eight_bits: Any, calibrated: Any, rows: int) -> None:
+    """NaN in what captured kernels round, then in one observation's state and image."""
+    runner, several, noise = in_eight_bits, calibrated[1].each(lambda part: part[:rows]), calibrated[2][:rows]
+
+    def finite(given: Observation) -> list[bool]:
+        return runner.sample(given, noise, 10).actions.isfinite().flatten(1).all(1).tolist()
+
+    right = runner.sample(several, noise, 10).actions.clone()
+    vision, layers = runner._tower.layers, runner._prefix.layers
+    matrices: list[Any] = [vision[3].out[0], layers[0].qkv, layers[2].out, layers[4].gate_up, layers[5].down]
+    numbers = [vision[0].qkv[1], vision[1].fc1[1], vision[2].norm1[0], layers[1].norm2]
+    for one in [*numbers, *(matrix.scale for matrix in matrices)]:
+        before = one[3].clone()
+        one[3] = torch.nan
+        assert finite(several) == [False] * rows
+        one[3] = before
+    for name, at in (("images", (0, 1, 100, 30, 0)), ("state", (0, 2))):
+        damaged = getattr(several, name).float().clone()
+        damaged[at] = torch.nan
+        assert finite(replace(several, **{name: damaged})) == [False, True, True][:rows], name
+    assert torch.equal(runner.sample(several, noise, 10).actions, right)

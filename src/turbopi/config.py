@@ -156,6 +156,7 @@ class ModelConfig:
     """The whole network of a Pi0 or Pi0.5. `action_horizon` shapes no weight: any H runs."""
 
     kind: PiKind = "pi05"
+    expert_inputs: ClassVar[bool] = True  # what `quantization.sites` asks; so is `last_read`
     vision: VisionConfig = VisionConfig()
     vlm: GemmaConfig = GemmaConfig(width=2048, mlp_dim=16384)
     expert: GemmaConfig = GemmaConfig(width=1024, mlp_dim=4096)
@@ -178,6 +179,10 @@ class ModelConfig:
         """Numbers of state that the network takes."""
         reads_states = self.memory is not None and self.memory.proprioceptive
         return self.memory.state_dim if self.memory is not None and reads_states else self.action_dim
+
+    @property
+    def last_read(self) -> int:
+        return self.vlm.depth - 1
 
     def __post_init__(self) -> None:
         """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
@@ -392,7 +397,7 @@ class PolicyConfig:
 
     @property
     def planned_model(self) -> ModelConfig:
-        """`model`, for what Pi0 and Pi0.5 alone have: engines, quantization, their own plan and roofline.
+        """`model`, for what Pi0 and Pi0.5 alone have: engines, conversions, their own plan and roofline.
 
         Raises ConfigError for other families.
         """
@@ -400,7 +405,7 @@ class PolicyConfig:
             what = f"{self.model.kind}{' with memory' if isinstance(self.model, ModelConfig) else ''}"
             raise ConfigError(
                 f"{self.name} is a {what} policy, and this is for Pi0 and Pi0.5 alone: there are no "
-                f"engines, calibrations or conversions of a {what} yet. `turbopi infer`, `serve`, `bench`, `verify` "
+                f"engines or conversions of a {what} yet. `turbopi infer`, `serve`, `bench`, `verify` "
                 "and `inspect` take it, on the backends that docs/support.md names"
             )
         return self.model

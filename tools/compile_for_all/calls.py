@@ -69,7 +69,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_rest(),
         *_backward(),
         *_backward_form(),
-        *_smolvla(target),
+        *_smolvla(target, inverses),
         _one_token,
     ]
     calls += [partial(_geglu, one) for one in inverses]
@@ -268,15 +268,15 @@ def _rest() -> Calls:
     ]
 
 
-def _smolvla(target: Target) -> Calls:
+def _smolvla(target: Target, inverses: tuple[Input, ...]) -> Calls:
     """Two images of 1,024 patches, which are 64 places each; 48 of the prompt; the state."""
     heads, groups, width, hidden, places = 15, 5, 960, 2560, SMOLVLA_PLACES
 
-    def layer() -> None:
+    def layer(input: Input) -> None:
         cos, cache = of(places, 32, dtype=F32), of(groups, places, 64)
         q = grouped.rope_grouped(of(places, (heads + 2 * groups) * 64), cos, cos, cache, cache)
-        grouped.grouped_attention(q, cache, cache, of(1, dtype=torch.int64))
-        grouped.swiglu(of(places, 2 * hidden))
+        grouped.grouped_attention(q, cache, cache, of(1, dtype=torch.int64), **input, **_marks(input))
+        grouped.swiglu(of(places, 2 * hidden), **input, **_marks(input))
 
     def several(*, own: bool) -> None:
         """Attention of the expert's 50 actions of each of two observations."""
@@ -293,7 +293,7 @@ def _smolvla(target: Target) -> Calls:
 
     parts: tuple[tuple[int, ...], ...] = ((), (2,), (3,), (4,))
     return [
-        layer,
+        *(partial(layer, one) for one in inverses),
         *(partial(several, own=own) for own in (False, True)),
         *(partial(rms, y) for y in (None, *((*one, places, width) for one in parts))),
         *(partial(_layer_norm, 2048, 768, y, {}) for y in (None, *((*one, 2048, 768) for one in parts))),

@@ -130,7 +130,9 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
         for weights in [one for one, refusal in refusals.items() if not (refusal and refusal(target.capability))]:
             label = weights if weights == "bf16" else weights.upper()
             yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
-    yield "SmolVLA's denoise.kernel, H=50, bf16", partial(_smolvla_denoising, target)
+    yield "SmolVLA's denoise.kernel, H=50, bf16", partial(_smolvla_denoising, target, "bf16")
+    if int8_refusal(target.capability) is None:
+        yield "SmolVLA's denoise.kernel, H=50, INT8", partial(_smolvla_denoising, target, "int8")
 
 
 def hopper_backward() -> dict[str, Callable[[Path | None], bytes]]:
@@ -162,10 +164,10 @@ def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path
     return _loop(target, expert, PI05, machine_code.CACHE_ROWS, suffix, weights, folder)
 
 
-def _smolvla_denoising(target: Target, folder: Path | None) -> bytes:
+def _smolvla_denoising(target: Target, weights: WeightNumbers, folder: Path | None) -> bytes:
     config = BASE.model
     assert isinstance(config, SmolVLAConfig)
-    return _loop(target, smolvla.ExpertSizes.of(config), smolvla.form(config), SMOLVLA_PLACES, 50, "bf16", folder)
+    return _loop(target, smolvla.ExpertSizes.of(config), smolvla.form(config), SMOLVLA_PLACES, 50, weights, folder)
 
 
 def _loop(

@@ -221,6 +221,7 @@ def choose(
         on_gpu = device.type == "cuda"
         untried = _untried(device, precision, model) if on_gpu else None
         slow = on_gpu and precision == "int8" and torch.cuda.get_device_capability(device) == (9, 0)
+        slow = slow and (model is None or family_of(model).planned)  # measured of these alone
         said = [f"the fast one of those that run in {precision}", untried, "fp8 and bf16 are quicker here" * slow]
         return "fused", f"auto: {'; '.join(one for one in said if one)}"
     if device.type == "cpu":
@@ -334,8 +335,12 @@ def check(
         if precision == WEIGHTS_ALONE:
             where = "models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU"
         raise ConfigError(f"backend {name!r} doesn't run in {precision!r}: {where}")
-    if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
-        raise BackendUnavailable(why)
+    if given is not None:
+        if precision not in (its := class_for(name, given).precisions):
+            what = f"{family_of(given).label} in {' or '.join(its)} alone, not in {precision!r}"
+            raise ConfigError(f"backend {name!r} runs {what}")
+        if (why := class_for(name, given).refuses_model(given)) is not None:
+            raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
     if precision in ROUNDED and reason is not None and device.type != "cuda":
         which = {"int8": "8.x, 9.0 or 12.x", "nvfp4": "10.x, 11.0 or 12.x", HALF_SUMS: "8.9 or 12.x"}
@@ -360,7 +365,7 @@ def _is_for(precision: Precision, model: Network) -> bool:
     family = family_of(model)
     if precision == WEIGHTS_ALONE:
         return family.reader is not None
-    return family.planned or precision not in TIERS
+    return family.linears is not None or precision not in TIERS
 
 
 def _not_for(precision: Precision, model: Network) -> str:

@@ -70,7 +70,7 @@ class CapturedBackend(PyTorchBackend):
         make_caches_writable()
         super().load_weights(load)
         self._stages = self._make_stages()
-        if self.precision == "bf16" and hasattr(self.model, "attend"):
+        if self.precision != "f32" and hasattr(self.model, "attend"):
             self.model.attend = _attend
         self._graphs: dict[Size, Graphs] = {}
         self._pool = torch.cuda.graph_pool_handle()

@@ -15,8 +15,9 @@ from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.engine.emulate import Round, input_rounding, put_into_norm, put_product, round_weight
 from turbopi.kernels.portable.quantize import quantize
+from turbopi.models import linears
 from turbopi.models.pi0.conditioning import Form
-from turbopi.models.pi0.sites import linears, norm_of
+from turbopi.models.pi0.sites import norm_of
 from turbopi.quantization.fp8 import Matrix, to_e4m3
 from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites

@@ -29,7 +29,7 @@ from turbopi.engine.plan import MAX_CAMERAS, bucket
 from turbopi.engine.weight_placement import HOST, WeightPlacement, is_conditioning, rows_of_parts
 from turbopi.engine.weights import Weights, pack
 from turbopi.kernels.interface import Denoiser, GemmaLayer, KeepingDenoiser, Ops, PairDenoiser
-from turbopi.kernels.portable.quantize import rounded_matrix
+from turbopi.kernels.portable.quantize import by_plan
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.formats import INT8, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix
@@ -320,11 +320,7 @@ class FusedBackend(CudaGraphBackend):
         ]
 
     def _quantized(self, place: str, matrix: Matrix) -> Tensor | RoundedMatrix:
-        if self._plan is None or place not in self._plan.scales:
-            return matrix
-        directions, parts = self._directions.get(place), rows_of_parts(self.config, place)
-        made = rounded_matrix(matrix, self._plan.scales[place], directions, self._plan.format, parts)
-        return made.for_half_sums() if isinstance(made, ScaledMatrix) and self._plan.has_half_sums(place) else made
+        return by_plan(self._plan, place, matrix, rows_of_parts(self.config, place))
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)

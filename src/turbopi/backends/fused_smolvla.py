@@ -2,10 +2,14 @@
 
 Steps of a conditioned call, which that kernel doesn't take, run as in `cuda_graph`: the reference's, captured. So do
 all where that kernel failed its self-test. Those of several observations are operations (engine/smolvla_batch.py).
+
+In FP8 or INT8 matmuls of vision and of the text layers are in eight bits, as a calibration says. That kernel then has
+the expert's weights in INT8 or, beside FP8, in bfloat16. All other ways to denoise are in bfloat16.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -24,10 +28,13 @@ from turbopi.engine.smolvla_batch import ExpertByOps
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
+from turbopi.kernels.portable.quantize import by_plan
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.kv_cache import KVCache
 from turbopi.models.smolvla.config import SmolVLAConfig
+from turbopi.quantization.calibration_file import Quantization
+from turbopi.quantization.plan import PrecisionPlan
 
 
 @dataclass(frozen=True)
@@ -50,17 +57,22 @@ class _Loop:
 
 
 class FusedSmolVLABackend(CapturedBackend):
-    """In bfloat16."""
+    """In bfloat16 or, as a calibration says, partly in FP8 or INT8: `describe()` says what runs."""
 
     name: ClassVar[str] = "fused"
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "fp8", "fp8-mlp", "int8")
     # on an H200, h200_2026-11-29_smolvla_batches.json.xz: one observation has the denoising kernel, several don't
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.99, 4: 2.58, 8: 3.77}
     _dtype: ClassVar[torch.dtype] = torch.bfloat16
+    _plan: PrecisionPlan | None = None
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
         return FusedBackend.unavailable(device)
+
+    @classmethod
+    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
+        return FusedBackend.unavailable_in(device, precision)
 
     @classmethod
     def refuses_model(cls, config: Network) -> str | None:
@@ -72,21 +84,24 @@ class FusedSmolVLABackend(CapturedBackend):
         return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'auto'"
 
     def load_weights(self, load: LoadState) -> None:
+        given = self._quantization
+        self._plan = None if given is None else given.plan(self.config, self.precision)
         super().load_weights(
-            lambda to, precision: load(smolvla.Placement(self.config, self.device, self._dtype), precision)
+            lambda to, precision: load(smolvla.Placement(self.config, self.device, self._dtype), "bf16")
         )
         self._tiles, self._without = tiles_of(self.device), excluded(self.device, self.precision, self.config)
         ops = self._make_ops()
-        self._tower = smolvla.Vision.pack(self.model, ops, self._dtype)
-        self._prefix = smolvla.Prefix.pack(self.model, ops, self._dtype)
+        make = partial(by_plan, self._plan)
+        self._tower = smolvla.Vision.pack(self.model, ops, self._dtype, make)
+        self._prefix = smolvla.Prefix.pack(self.model, ops, self._dtype, make)
         self._prefix_of = self._prefix_stage
-        self._expert = smolvla.Expert.pack(self.model)
+        self._expert = smolvla.Expert.pack(self.model, self._plan)
         self._ops, self._origin = ops, ops.origin
         self._by_ops: ExpertByOps | None = None  # its matrices are made for the first batch
         empty_cache()  # of what loading and packing needed besides
 
     def _make_ops(self) -> Ops:
-        return fused_ops(self.device, self._tiles.table, self._without)
+        return fused_ops(self.device, self._tiles.table, self._without, self.precision)
 
     def _make_denoiser(self, num_steps: int, **sizes: Any) -> PortableDenoiser:
         return self._expert.denoiser(num_steps, device=self.device, **sizes)
@@ -119,7 +134,26 @@ class FusedSmolVLABackend(CapturedBackend):
         if self._by_ops is not None:
             denoising["operations"] = ["calls of several observations"]
         made = {"operations": dict(self._origin), "tiles": self._tiles.about, "denoising": denoising}
+        if self._plan is not None and self._quantization is not None:
+            made[self._plan.format.name] = self._in_eight_bits(self._plan, self._quantization)
         return super().describe() | made | ({"excluded": dict(self._without)} if self._without else {})
+
+    def _in_eight_bits(self, plan: PrecisionPlan, calibration: Quantization) -> dict[str, Any]:
+        described = calibration.describe(plan)
+        groups = described["plan"]
+        if plan.expert == "bf16":
+            why = next(reason for site, reason in plan.kept.items() if site.startswith("expert."))
+            expert = f"bf16, all of it, as its kernel takes one precision; {why}"
+        else:
+            expert = "bf16, a captured step at a time" if DENOISE in self._without else plan.expert
+            groups["expert of conditioned calls"] = "bf16, a captured step at a time"
+            if self._by_ops is not None:
+                groups["expert of batches"] = "bf16, as operations denoise"
+        for name, what in groups.items():
+            if name.startswith("expert.") and what == plan.format.name:
+                groups[name] = expert
+        groups["expert"] = expert
+        return described
 
     def _vision(self, observation: Observation, mark: Mark) -> Tensor:
         return self._tower(observation.images.flatten(0, 1), lambda: mark(HEAD))

@@ -1,21 +1,22 @@
 """What rounding does to each site's own products, everything before them exact."""
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.engine.emulate import MakeMatrix, Round, RoundedWeights, input_rounding, replaced, through_norm
+from turbopi.models import linears
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.layers import AdaRMSNorm
-from turbopi.models.pi0.reference import Pi0Model
-from turbopi.models.pi0.sites import linears, norm_of
+from turbopi.models.pi0.sites import norm_of
 from turbopi.quantization.sites import Site
 
 
 def product_errors(
-    model: Pi0Model,
+    model: Any,
     scales: Mapping[Site, float],
     batches: Iterable[tuple[Observation, Tensor]],
     steps: int,

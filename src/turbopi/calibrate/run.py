@@ -25,8 +25,7 @@ from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.emulate import NO_SIGNAL, RoundedWeights, delta_cosine, has_signal, relative_rms, rounded
 from turbopi.engine.graph import collect_and_empty_cache
-from turbopi.models import family_of
-from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
+from turbopi.models import FAMILIES, family_of
 from turbopi.policy import shipped
 from turbopi.policy.examples import NoisyExample, with_noises
 from turbopi.policy.policy import UnifiedPolicy
@@ -71,11 +70,12 @@ class Progress:
 
 def check_family(checkpoint: Checkpoint) -> None:
     """Raise ConfigError for a model that no calibration is for, before anything else is read."""
-    if (family := family_of(checkpoint.config.model)).planned:
+    if (family := family_of(checkpoint.config.model)).linears is not None:
         return
+    names = ", ".join(one.label for one in FAMILIES.values() if one.linears is not None)
     other = ", or on an NVIDIA GPU in 'int8-weights', which needs none" if family.reader is not None else ""
     raise ConfigError(
-        f"calibrations are for Pi0 and Pi0.5 alone, and {checkpoint.config.name} is {family.label}: run it in "
+        f"calibrations are for {names} alone, and {checkpoint.config.name} is {family.label}: run it in "
         f"precision 'bf16'{other}"
     )
 
@@ -95,11 +95,11 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     policy = UnifiedPolicy(checkpoint, **arguments)
     source, examples = observed.read_examples(policy, settings.observations, settings.count)
     chosen, held = observed.split(examples)
-    config = policy.config.planned_model
+    model = reference_model(policy.backend)
+    config = model.config
     shape = (config.action_horizon, config.action_dim)
     calibration = with_noises(chosen, shape, settings.noises, settings.seed)
     held_out = with_noises(held, shape, settings.noises, settings.seed + len(calibration))
-    model = reference_model(policy.backend)
     steps = int(policy.metadata["num_denoising_steps"])
     loaded = time.perf_counter()
     result = calibrate_model(model, calibration, held_out, steps, settings, progress)
@@ -146,7 +146,7 @@ class Measured:
 
 
 def calibrate_model(
-    model: Pi0Model,
+    model: Any,
     calibration: Sequence[NoisyExample],
     held_out: Sequence[NoisyExample],
     steps: int,
@@ -253,7 +253,7 @@ class _Trials:
 
     def __init__(
         self,
-        model: Pi0Model,
+        model: Any,
         calls: Sequence[NoisyExample],
         steps: int,
         size: int,
@@ -285,9 +285,7 @@ class _Trials:
     def calls(self) -> list[NoisyExample]:
         return [call for calls, _ in self._made for call in calls]
 
-    def actions(
-        self, scales: Mapping[Site, float], model: Pi0Model | None = None, half_sums: bool = False
-    ) -> list[Tensor]:
+    def actions(self, scales: Mapping[Site, float], model: Any = None, half_sums: bool = False) -> list[Tensor]:
         """Of every batch, with these sites rounded."""
         used = model or self._model
         with rounded(used, scales, self._weights, half_sums):
@@ -397,7 +395,7 @@ def _keep_groups(
 
 
 def _held_out(
-    model: Pi0Model,
+    model: Any,
     eligible: Sequence[Site],
     scales: Mapping[Site, float],
     kept: Mapping[str, str],
@@ -420,8 +418,9 @@ def _held_out(
         actions[case] = trials.actions(own, half_sums=case == HALF_SUMS)
         report[case] = trials.error(actions[case])
         progress.advance()
-    state = {name: tensor.to(parameter_dtype(name, "bf16")) for name, tensor in model.state_dict().items()}
-    plain = trials.actions({}, Pi0Model.from_state(model.config, state))
+    family, config = family_of(model.config), model.config
+    state = {name: one.to(family.parameter_dtype(name, "bf16", config)) for name, one in model.state_dict().items()}
+    plain = trials.actions({}, family.reference.from_state(config, state))
     report["bf16"] = trials.error(plain)
     report[f"{name} against bf16"] = trials.error(actions[name], plain)
     progress.advance()

@@ -12,10 +12,10 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from turbopi.models import linears
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.layers import AdaRMSNorm
-from turbopi.models.pi0.reference import Pi0Model
-from turbopi.models.pi0.sites import linears, norm_of
+from turbopi.models.pi0.sites import norm_of
 from turbopi.quantization.directions import Rows
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.sites import Site
@@ -82,7 +82,7 @@ class Histogram:
 
 
 def collect(
-    model: Pi0Model,
+    model: Any,
     sites: Iterable[Site],
     batches: Iterable[tuple[Observation, Tensor]],
     steps: int,
@@ -112,7 +112,7 @@ def collect(
 
 @contextmanager
 def _watched(
-    model: Pi0Model,
+    model: Any,
     sites: Iterable[Site],
     counts: dict[str, Tensor],
     largest: dict[str, Tensor],

@@ -3,9 +3,11 @@
 import logging
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.quantized_folder import QuantizedSource
+from turbopi.models import family_of
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.formats import Numbers
 from turbopi.quantization.plan import TIERS, format_of
@@ -27,7 +29,7 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     if quantization is None:
         return None
     if checkpoint.path is None:  # then `calibration_of` has checked the shapes alone
-        quantization.check(checkpoint.config.planned_model, checkpoint.fingerprint(trust_files=True))
+        quantization.check(_sizes(checkpoint), checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
         logger.warning("%s: %s", quantization.format.label, warning)
     return quantization
@@ -45,7 +47,7 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
     if tier not in TIERS:
         check_given(tier, given)
         return None
-    model = checkpoint.config.planned_model
+    model = _sizes(checkpoint)
     if given is None:
         numbers = format_of(tier).name
         beside = None if checkpoint.path is None else checkpoint.path / BESIDE[numbers]
@@ -70,3 +72,10 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
             f"{quantization.source or 'the calibration'} leaves nothing in {tier} ({reasons}); take 'bf16'"
         )
     return quantization
+
+
+def _sizes(checkpoint: Checkpoint) -> Any:
+    """Raises ConfigError for a model that no calibration is for."""
+    if (family := family_of(checkpoint.config.model)).linears is None:
+        raise ConfigError(f"{checkpoint.config.name} is {family.label}, which has no calibrations; take 'bf16'")
+    return checkpoint.config.model

@@ -7,6 +7,7 @@ any device.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.kernels.portable.quantize import rounded_matrix
+from turbopi.models import linears
 from turbopi.models.pi0.layers import AdaRMSNorm, inverse_rms
-from turbopi.models.pi0.reference import Pi0Model
-from turbopi.models.pi0.sites import linears, norm_of
+from turbopi.models.pi0.sites import norm_of
 from turbopi.quantization.formats import FP8, Format, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.sites import Site
@@ -61,7 +62,7 @@ class RoundedWeights:
 
 @contextmanager
 def rounded(
-    model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None, half_sums: bool = False
+    model: Any, scales: Mapping[Site, float], weights: RoundedWeights | None = None, half_sums: bool = False
 ) -> Iterator[None]:
     """For a while, matmuls of these sites are of rounded numbers, of the weights' format; with `half_sums` the expert's
     alone have float32 sums.

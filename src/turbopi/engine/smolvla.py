@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from turbopi.config import GemmaConfig
 from turbopi.engine.forward import HEAD_LAYERS, Rope, VisionByOps
-from turbopi.engine.weight_placement import WeightPlacement
+from turbopi.engine.weight_placement import MakeMatrix, WeightPlacement, in_whole_lines
 from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, VisionStream
 from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
@@ -30,6 +30,9 @@ from turbopi.models.pi0.layers import rope_tables
 from turbopi.models.pi0.vision import EncoderLayer, normalize_images
 from turbopi.models.smolvla.config import ROPE_BASE, SmolVLAConfig
 from turbopi.models.smolvla.reference import Layer, SmolVLAModel, pixel_shuffle
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, input_of
+from turbopi.quantization.nvfp4 import Nvfp4Matrix
+from turbopi.quantization.plan import PrecisionPlan
 
 
 def refusal(config: SmolVLAConfig) -> str | None:
@@ -37,6 +40,10 @@ def refusal(config: SmolVLAConfig) -> str | None:
     if config.text.head_dim < 16 or config.vision.head_dim < 16:
         return "heads are narrower than a tensor core's 16 columns"
     return refusal_of_sizes(ExpertSizes.of(config).expert)
+
+
+def _as_it_is(place: str, matrix: Tensor) -> Matrix:
+    return matrix
 
 
 class Placement(WeightPlacement):
@@ -71,10 +78,11 @@ class Vision:
     projector: Tensor
 
     @classmethod
-    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Vision":
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, make: MakeMatrix = _as_it_is) -> "Vision":
+        """make: what becomes of the layers' matrices; the model loses those that are rounded."""
         vision, side = model.vision, model.config.image_size // model.config.vision.patch_size
         weight, bias = _affine(vision.patch_embedding, dtype)
-        layers = [_vision_layer(layer, dtype) for layer in vision.layers]  # type: ignore[arg-type]
+        layers = [_vision_layer(layer, dtype, make, i) for i, layer in enumerate(vision.layers)]  # type: ignore[arg-type]
         norm = _affine(vision.post_layernorm, dtype)
         positions = vision.positions(side, side).to(dtype)
         return cls(model, ops, layers, (weight.flatten(1), bias), positions, norm, model.projector.weight.to(dtype))
@@ -125,16 +133,31 @@ def _merged(modules: Sequence[nn.Linear], dtype: torch.dtype) -> Tensor:
     return whole
 
 
-def _vision_layer(layer: EncoderLayer, dtype: torch.dtype) -> VisionLayer:
+def _made(make: MakeMatrix, place: str, *modules: nn.Linear, dtype: torch.dtype) -> Matrix:
+    """What `make` makes of their weights, `_merged`. Of rounded ones the modules keep nothing: nobody reads them."""
+    made = make(place, _merged(modules, dtype))
+    assert not isinstance(made, Nvfp4Matrix), "a backend's precisions say what it has"
+    if isinstance(made, ScaledMatrix):
+        for one in modules:
+            one.weight.data = one.weight.data.new_empty(0)
+    return made
+
+
+def _vision_layer(layer: EncoderLayer, dtype: torch.dtype, make: MakeMatrix, number: int) -> VisionLayer:
     attention, mlp = layer.self_attn, layer.mlp
     projections = (attention.q_proj, attention.k_proj, attention.v_proj)
+
+    def matrix(kind: str, *modules: nn.Linear) -> Matrix:
+        return _made(make, f"vision.{number}.{kind}", *modules, dtype=dtype)
+
+    fc1, fc2 = in_whole_lines(matrix("fc1", mlp.fc1), matrix("fc2", mlp.fc2))
     return VisionLayer(
         norm1=_affine(layer.layer_norm1, dtype),
-        qkv=(_merged(projections, dtype), torch.cat([one.bias.to(dtype) for one in projections])),
-        out=_affine(attention.out_proj, dtype),
+        qkv=(matrix("qkv", *projections), torch.cat([one.bias.to(dtype) for one in projections])),
+        out=(matrix("out", attention.out_proj), attention.out_proj.bias.to(dtype)),
         norm2=_affine(layer.layer_norm2, dtype),
-        fc1=_affine(mlp.fc1, dtype),
-        fc2=_affine(mlp.fc2, dtype),
+        fc1=(fc1, F.pad(mlp.fc1.bias.to(dtype), (0, fc1.shape[0] - len(mlp.fc1.bias)))),
+        fc2=(fc2, mlp.fc2.bias.to(dtype)),
     )
 
 
@@ -151,7 +174,7 @@ class Prefix:
 
     model: SmolVLAModel
     ops: Ops
-    layers: list[GemmaLayer[Tensor]]
+    layers: list[GemmaLayer[Any]]
     every: int
     across: list[tuple[slice, Tensor]]
     special: tuple[Tensor, Tensor]  # embeddings around each image, [start or end tokens, D]
@@ -159,7 +182,8 @@ class Prefix:
     _numbered: dict[tuple[int, int], tuple[Tensor, Rope]] = field(default_factory=dict)
 
     @classmethod
-    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype) -> "Prefix":
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, make: MakeMatrix = _as_it_is) -> "Prefix":
+        """make: as of `Vision`"""
         config, embed, every = model.config, model.vlm.embed_tokens, form(model.config).self_every
 
         def matrices(its: slice) -> Tensor:
@@ -174,7 +198,7 @@ class Prefix:
             for ids in (config.image_start, config.image_end)
         )
         scale = float(torch.tensor(config.text.width**0.5, dtype=dtype))  # rounded, as LeRobot's is
-        layers = [joined(layer, dtype) for layer in model.vlm.layers]
+        layers = [joined(layer, dtype, make, f"prefix.{i}") for i, layer in enumerate(model.vlm.layers)]
         return cls(model, ops, layers, every, across, (start, end), scale)
 
     def places(self, cameras: int) -> int:
@@ -234,12 +258,13 @@ class Prefix:
         k, v = made = x.new_empty(2, text.depth, text.num_kv_heads, len(x), text.head_dim)
         y, eps = None, text.rms_norm_eps
         for i, layer in enumerate(self.layers):
-            x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps)
+            x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps, **input_of(layer.qkv))
             last = i + 1 == len(self.layers)  # its keys and values alone are read
             matrix = layer.qkv[-2 * text.num_kv_heads * text.head_dim :] if last else layer.qkv
             q = rope_grouped(ops.linear(normed, matrix), *rope, k[i], v[i])
             if not last:
-                x, y = behind_attention(ops, layer, x, grouped_attention(q, k[i], v[i], lengths), eps)
+                attended = grouped_attention(q, k[i], v[i], lengths, **input_of(layer.out, x))
+                x, y = behind_attention(ops, layer, x, attended, eps)
         return made
 
     def of_expert(self, keys_values: Tensor) -> Tensor:
@@ -264,11 +289,13 @@ def rope_at(positions: Tensor, config: SmolVLAConfig) -> Rope:
 
 
 def behind_attention(
-    ops: Ops, layer: GemmaLayer[Tensor], x: Tensor, attended: Tensor, eps: float
+    ops: Ops, layer: GemmaLayer[Any], x: Tensor, attended: Tensor, eps: float
 ) -> tuple[Tensor, Tensor]:
     """The rest of a layer: the residual stream [rows, D], and what the next norm adds to it."""
-    x, normed = ops.residual_rms_norm(x, ops.residual_linear(attended, layer.out), None, layer.norm2, None, eps)
-    return x, ops.residual_linear(swiglu(ops.linear(normed, layer.gate_up)), layer.down)
+    y = ops.residual_linear(attended, layer.out)
+    x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
+    hidden = swiglu(ops.linear(normed, layer.gate_up), **input_of(layer.down, x))
+    return x, ops.residual_linear(hidden, layer.down)
 
 
 # -- the expert -------------------------------------------------------------------------------------------------------
@@ -285,10 +312,7 @@ class ExpertSizes:
 
     @classmethod
     def of(cls, config: SmolVLAConfig) -> "ExpertSizes":
-        text = config.text
-        heads = (text.num_heads, text.num_kv_heads, text.head_dim)
-        expert = GemmaConfig(config.expert_width, config.expert_mlp, config.expert_depth, *heads)
-        return cls(expert, config.action_dim, text.rms_norm_eps)
+        return cls(config.expert, config.action_dim, config.text.rms_norm_eps)
 
 
 def form(config: SmolVLAConfig) -> Form:
@@ -309,13 +333,17 @@ class Expert:
     model: SmolVLAModel
 
     @classmethod
-    def pack(cls, model: SmolVLAModel) -> "Expert":
+    def pack(cls, model: SmolVLAModel, plan: PrecisionPlan | None = None) -> "Expert":
+        """plan: in what its matrices are; None: in bfloat16"""
         config, layers = model.config, model.expert.layers
         norms = [norm for layer in layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
         scale = torch.stack([norm.weight.float() for norm in (*norms, model.expert.norm)])
         table = torch.stack((scale, torch.zeros_like(scale), torch.ones_like(scale)), dim=1)[None]
         one_by_one = (joined(layer, torch.bfloat16) for layer in layers)
-        packed = PackedExpert.pack(ExpertSizes.of(config), one_by_one, form=form(config))
+        rounded: dict[str, Any] = {}
+        if plan is not None and plan.expert != "bf16":
+            rounded = {"inputs": plan.scales, "directions": plan.directions, "format": plan.format}
+        packed = PackedExpert.pack(ExpertSizes.of(config), one_by_one, form=form(config), **rounded)
         return cls(packed, table, model)
 
     def denoiser(
@@ -344,7 +372,7 @@ class Expert:
         )
 
 
-def joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
+def joined(layer: Layer, dtype: torch.dtype, make: MakeMatrix = _as_it_is, place: str = "") -> GemmaLayer[Any]:
     """A layer across has keys and values of its own, made of the prefix's: their rows here are zeros, which are never
     read.
     """
@@ -352,11 +380,15 @@ def joined(layer: Layer, dtype: torch.dtype) -> GemmaLayer[Tensor]:
     q = of.q_proj.weight.to(dtype)
     across = of.k_proj.weight.shape[1] != q.shape[1]
     none = q.new_zeros(2 * len(of.k_proj.weight), q.shape[1]) if across else q[:0]
+
+    def matrix(kind: str, *modules: nn.Linear) -> Matrix:
+        return _made(make, f"{place}.{kind}", *modules, dtype=dtype)
+
     return GemmaLayer(
-        torch.cat((q, none)) if across else _merged((of.q_proj, of.k_proj, of.v_proj), dtype),
-        of.o_proj.weight.to(dtype),
-        _merged((mlp.gate_proj, mlp.up_proj), dtype),
-        mlp.down_proj.weight.to(dtype),
+        torch.cat((q, none)) if across else matrix("qkv", of.q_proj, of.k_proj, of.v_proj),
+        matrix("out", of.o_proj),
+        matrix("gate_up", mlp.gate_proj, mlp.up_proj),
+        matrix("down", mlp.down_proj),
         layer.input_layernorm.weight.float(),
         layer.post_attention_layernorm.weight.float(),
     )

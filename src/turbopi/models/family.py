@@ -1,6 +1,6 @@
 """What a family of models gives beside its sizes (config.py) and its reference: what all other code asks about it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -8,8 +8,10 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from turbopi.config import FloatPrecision, Kind
+from turbopi.quantization.sites import Site
 
 
 class Pieces(Protocol):
@@ -56,8 +58,9 @@ class Family:
 
     The loop that the engine, the backends and the roofline plan by:
 
-    planned          whether the engine has a plan for it, its kernels and its quantization; else backends run the
-                     reference
+    planned          whether the engine has a plan for it and its kernels; else backends run the reference
+    linears          (reference, site) -> that site's matrices, of which the first one's input is the activation: what
+                     calibration and emulation round. None: it runs in no precision that takes a calibration
     modulated        the time scales, shifts and gates the expert's norms (adaRMS); else it is mixed into the actions'
                      tokens
     state_token      the state is a token before the actions, which it doesn't see; else it is in the prompt, in the
@@ -89,6 +92,7 @@ class Family:
     counts: Callable[[Any, int, int, int, int, int], dict[str, tuple[int, int]]] | None = None
     prompt: Callable[[Any, str, str], str] | None = None
     reader: Callable[[Any, Pieces, Path | None], AnswerReader] | None = None
+    linears: Callable[[Any, Site], Iterator[nn.Linear]] | None = None
 
     @property
     def state_in_prompt(self) -> bool:

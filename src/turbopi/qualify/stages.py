@@ -101,7 +101,7 @@ class Subject:
 
 def stretched(quantization: Quantization, checkpoint: Checkpoint) -> Quantization:
     """For all layers of a checkpoint, from the shallow model's: the last ones are alike, and so are all others."""
-    model = checkpoint.config.planned_model
+    model: Any = checkpoint.config.model
 
     def origin(site: Site) -> str:
         part = "vlm" if site.part == "prefix" else site.part

@@ -14,11 +14,10 @@ from typing import Any
 
 import torch
 
-from turbopi.config import ModelConfig
 from turbopi.quantization.formats import FORMATS, Format, Numbers
 from turbopi.quantization.fp8 import E4M3, Directions
 from turbopi.quantization.plan import HALF_SUMS, TIERS, PrecisionPlan, format_of, reason_for_bf16
-from turbopi.quantization.sites import PARTS, Part, sites
+from turbopi.quantization.sites import PARTS, Part, Stacks, sites
 from turbopi.support.errors import CalibrationError, ConfigError
 from turbopi.support.files import write_whole
 from turbopi.support.reading import is_finite, is_integer, one_line, read_json, shown
@@ -140,7 +139,7 @@ class Quantization:
             raise ConfigError(f"{self.format.label} in no part at all; use precision 'bf16'")
         return replace(self, parts=tuple(part for part in PARTS if part in parts))
 
-    def check_shapes(self, config: ModelConfig) -> None:
+    def check_shapes(self, config: Stacks) -> None:
         """Raise CalibrationError unless this was made for a model of these sizes."""
         where = self.source or "this calibration"
         wrong = list(_differences(self.shapes, shapes_of(config)))
@@ -159,7 +158,7 @@ class Quantization:
                     "it is damaged"
                 )
 
-    def check(self, config: ModelConfig, fingerprint: str) -> None:
+    def check(self, config: Stacks, fingerprint: str) -> None:
         """Raise CalibrationError unless this was made for these weights and this model."""
         self.check_shapes(config)
         if fingerprint != self.fingerprint:
@@ -169,7 +168,7 @@ class Quantization:
                 "checkpoint"
             )
 
-    def plan(self, config: ModelConfig, tier: str) -> PrecisionPlan:
+    def plan(self, config: Stacks, tier: str) -> PrecisionPlan:
         """What is rounded in a tier, and why the rest isn't. Raises ConfigError for a tier of other numbers, or
         float16 sums that cost too much.
         """
@@ -308,7 +307,7 @@ def _bytes(codes: torch.Tensor) -> bytes:
     return codes.contiguous().view(torch.uint8).numpy().tobytes()
 
 
-def shapes_of(config: ModelConfig) -> dict[str, Any]:
+def shapes_of(config: Stacks) -> dict[str, Any]:
     """The sizes that scales depend on, as JSON gives them back. Horizon and prompt length aren't among them."""
     return {
         "kind": config.kind,

@@ -86,10 +86,12 @@ class PrecisionPlan:
 
 def refusal(site: Site, format: Format) -> str | None:
     """Why a site can't be in a format, whatever its calibration says, or None."""
-    if site.last and not format.holds_nan:
+    if site.tells and not format.holds_nan:
         return f"{format.label} has no NaN, and a NaN of the prefix reaches the actions through these keys and values"
     if site.part not in format.parts:
         return f"{format.label} is for {' and '.join(format.parts)}: no denoising kernel has it"
+    if site.weights_alone and format.rounds_input(site.part):
+        return f"this family's denoising kernel takes no activations in {format.label}"
     return site.refusal
 
 

@@ -168,31 +168,29 @@ def _vision_layers(
 def _smolvla(
     config: SmolVLAConfig, call: Call, precision: Precision, kernels: Kernels, steps: int, horizon: int
 ) -> Iterator[Operation]:
-    """In bfloat16, which is how it runs. Prompts of all lengths have as many places."""
-    if precision != "bf16":
-        return
+    """Prompts of all lengths have as many places. Connector and actions are in bfloat16 in each precision."""
     v, text, factor = config.vision, config.text, config.scale_factor**2
     images, patches = call.cameras * call.batch, (config.image_size // v.patch_size) ** 2
     yield from _vision_layers(v, images, patches, v.depth, precision, kernels)
     rows = images * patches // factor
-    yield Operation("projector", kernels, "plain", precision, rows, text.width, factor * v.width, 1)
+    yield Operation("projector", kernels, "plain", "bf16", rows, text.width, factor * v.width, 1)
     around = len(config.image_start) + len(config.image_end)
     rows += images * around + call.batch * (config.max_prompt_tokens + 1)
     heads, kv = text.num_heads * text.head_dim, 2 * text.num_kv_heads * text.head_dim
 
-    def layer(part: str, rows: int, width: int, hidden: int, uses: int) -> Iterator[Operation]:
-        usual = Operation("", kernels, "plain", precision, rows, heads + kv, width, uses, batch=call.batch)
+    def layer(part: str, numbers: Numbers, rows: int, width: int, hidden: int, uses: int) -> Iterator[Operation]:
+        usual = Operation("", kernels, "plain", numbers, rows, heads + kv, width, uses, batch=call.batch)
         normed = replace(usual, norm_in_front="rms")
         yield replace(normed, name=f"{part} qkv")
         yield replace(usual, name=f"{part} out", operation="parts", columns=width, inner=heads, norm_behind="rms")
         yield replace(normed, name=f"{part} gate, up", columns=2 * hidden)
         yield replace(usual, name=f"{part} down", operation="parts", columns=width, inner=hidden, norm_behind="rms")
 
-    qkv, *others = layer("prefix", rows, text.width, text.mlp_dim, text.depth - 1)
+    qkv, *others = layer("prefix", precision, rows, text.width, text.mlp_dim, text.depth - 1)
     yield from (qkv, replace(qkv, name="prefix last k, v", columns=kv, uses=1), *others)
     if call.batch > 1:
         uses = config.expert_depth * steps
-        yield from layer("actions", call.batch * horizon, config.expert_width, config.expert_mlp, uses)
+        yield from layer("actions", "bf16", call.batch * horizon, config.expert_width, config.expert_mlp, uses)
 
 
 def _image_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:

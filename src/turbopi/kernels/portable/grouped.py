@@ -1,14 +1,22 @@
 """Text layers whose query heads share keys and values in groups: RoPE, attention and SwiGLU between their matmuls.
 
+With `inverse` a result leaves as `numbers`, E4M3 or int8, for the matmul behind it; int8's damage is marked in `stream`
+[tokens, D]: see `kernels.plain`.
+
 Shapes: B observations, S places of each, n query heads, g key heads, K head_dim, F hidden units.
 """
 
+from typing import Any
+
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.portable.rope import rotated
+from turbopi.kernels.portable.rounding import as_stored, damaged, marks
+from turbopi.quantization.fp8 import E4M3
 
 LOG2_E = 1.4426950408889634
 ROWS, KEYS = 32, 64  # of a program of attention: prompts are short, so there are many programs rather than large tiles
@@ -80,9 +88,9 @@ def _add_keys(queries, k, v, first, key, keys, seen, d, DIM: tl.constexpr, scale
 
 @triton.jit
 def _attention_kernel(
-    q, k, v, own_k, own_v, lengths, out, tokens, places, heads, scale,
+    q, k, v, own_k, own_v, lengths, out, tokens, places, heads, scale, inverse, residual, stride,
     GROUP: tl.constexpr, DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
-    SUFFIX: tl.constexpr, OWN: tl.constexpr, PDL: tl.constexpr,
+    SUFFIX: tl.constexpr, OWN: tl.constexpr, SCALED: tl.constexpr, MARKS: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """BLOCK_M rows of the queries of one key head of one observation."""
     kv_head, observation = tl.program_id(1), tl.program_id(2)
@@ -110,16 +118,22 @@ def _attention_kernel(
                 queries, own_k, own_v, block * tokens, start + n, tokens, token + 1, d, DIM, scale, acc, top, total
             )
     to = ((observation * tokens + token) * heads + kv_head * GROUP + m % GROUP)[:, None] * DIM + d[None, :]
-    tl.store(out + to, (acc / total[:, None]).to(out.dtype.element_ty), inside)
+    if SCALED:
+        total /= inverse
+    tl.store(out + to, as_stored(acc / total[:, None], out), inside)
+    if MARKS:
+        found = (token < tokens) & damaged(acc / total[:, None], 1)
+        tl.store(residual + (observation * tokens + token) * stride, float("nan"), found)
 
 
-def grouped_attention(q: Tensor, k: Tensor, v: Tensor, lengths: Tensor) -> Tensor:
+def grouped_attention(q: Tensor, k: Tensor, v: Tensor, lengths: Tensor, **rounded: Any) -> Tensor:
     """Queries [g, B * S * n/g, K] of B observations over keys and values [g, B * S, K] -> [B * S, n * K].
 
     lengths  int64[B], on the device, at least 1: how many of an observation's S places are valid, the first ones. The
              last of them sees all of these, the others all but that one. What lies beyond is never read
+    rounded  `inverse`, `numbers` and `stream`: see above
     """
-    return _attention(q, (k, v), (k, v), lengths, k.shape[1] // len(lengths), suffix=False, own=False)
+    return _attention(q, (k, v), (k, v), lengths, k.shape[1] // len(lengths), suffix=False, own=False, **rounded)
 
 
 def grouped_suffix_attention(
@@ -142,23 +156,30 @@ def _attention(
     *,
     suffix: bool,
     own: bool,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
 ) -> Tensor:
     assert all(one.is_contiguous() for one in (q, *prefix, *behind, lengths)), "rows are read as they lie in memory"
     kv_heads, rows, dim = q.shape
     batch = len(lengths)
     group = rows // (batch * tokens)
-    out = q.new_empty(batch * tokens, kv_heads * group * dim)
+    out = q.new_empty(batch * tokens, kv_heads * group * dim, dtype=result_dtype(q, inverse, numbers))
     warps = 8 if suffix and not own else 4  # of 4, a thread spills on compute capability 11.0
     _attention_kernel[(triton.cdiv(tokens * group, ROWS), kv_heads, batch)](
         q, *prefix, *behind, lengths, out, tokens, prefix[0].shape[1] // batch, kv_heads * group, dim**-0.5 * LOG2_E,
-        GROUP=group, DIM=dim, BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=ROWS, BLOCK_N=KEYS, SUFFIX=suffix, OWN=own,
-        num_warps=warps, num_stages=2, **dependent_launch(q),
+        inverse or 1.0, GROUP=group, DIM=dim, BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=ROWS, BLOCK_N=KEYS,
+        SUFFIX=suffix, OWN=own, SCALED=inverse is not None, num_warps=warps, num_stages=2, **marks(stream, out),
+        **dependent_launch(q),
     )  # fmt: skip
     return out
 
 
 @triton.jit
-def _swiglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
+def _swiglu_kernel(
+    gate_up, out, hidden, inverse, residual, stride,
+    SCALED: tl.constexpr, MARKS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
     wait_for_producer(PDL)
     launch_dependents(PDL)
     row = tl.program_id(1).to(tl.int64)
@@ -167,15 +188,24 @@ def _swiglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr)
     gate = tl.load(gate_up + row * 2 * hidden + cols, mask, 0.0).to(tl.float32)
     up = tl.load(gate_up + (row * 2 + 1) * hidden + cols, mask, 0.0).to(tl.float32)
     result = gate / (1 + tl.exp2(gate * -1.4426950408889634)) * up
-    tl.store(out + row * hidden + cols, result.to(out.dtype.element_ty), mask)
+    if SCALED:
+        result *= inverse
+    tl.store(out + row * hidden + cols, as_stored(result, out), mask)
+    if MARKS:
+        tl.store(residual + row * stride, float("nan"), damaged(result, 0))
 
 
-def swiglu(gate_up: Tensor) -> Tensor:
+def swiglu(
+    gate_up: Tensor, inverse: float | None = None, numbers: torch.dtype = E4M3, stream: Tensor | None = None
+) -> Tensor:
     """silu(gate) * up: [S, 2F], gate columns before up columns -> [S, F]"""
     assert gate_up.is_contiguous(), "gate_up is read as it lies in memory"
     rows, hidden = gate_up.shape[0], gate_up.shape[1] // 2
-    out = gate_up.new_empty(rows, hidden)
+    out = gate_up.new_empty(rows, hidden, dtype=result_dtype(gate_up, inverse, numbers))
     block = min(1024, triton.next_power_of_2(hidden))
     grid = (triton.cdiv(hidden, block), rows)
-    _swiglu_kernel[grid](gate_up, out, hidden, BLOCK=block, num_warps=max(1, block // 256), **dependent_launch(gate_up))
+    _swiglu_kernel[grid](
+        gate_up, out, hidden, inverse or 1.0, SCALED=inverse is not None, BLOCK=block, num_warps=max(1, block // 256),
+        **marks(stream, out), **dependent_launch(gate_up),
+    )  # fmt: skip
     return out

@@ -8,6 +8,7 @@ from torch import Tensor
 from turbopi.quantization.formats import FP8, NVFP4, Format, RoundedMatrix
 from turbopi.quantization.fp8 import Directions, Matrix, ScaledMatrix, channel_scales
 from turbopi.quantization.nvfp4 import Nvfp4Matrix
+from turbopi.quantization.plan import PrecisionPlan
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 from turbopi.support.toolchain import make_caches_writable
 
@@ -31,6 +32,16 @@ def quantize(
 ) -> ScaledMatrix:
     """weight [out, in] in its channels' own scales, rounded for its input's directions."""
     return round_channels(weight, directions, format).for_input(input_scale)
+
+
+def by_plan(
+    plan: PrecisionPlan | None, place: str, matrix: Matrix, parts: Sequence[int] = ()
+) -> Matrix | RoundedMatrix:
+    """The matrix at this place as the plan has it. parts: see `Nvfp4Matrix.of`."""
+    if plan is None or place not in plan.scales:
+        return matrix
+    made = rounded_matrix(matrix, plan.scales[place], plan.directions.get(place), plan.format, parts)
+    return made.for_half_sums() if isinstance(made, ScaledMatrix) and plan.has_half_sums(place) else made
 
 
 def round_channels(weight: Matrix, directions: Directions | None = None, format: Format = FP8) -> ScaledMatrix:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from turbopi.models.family import Family
 from turbopi.models.pi0.memory import MemoryModel
 from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
+from turbopi.models.pi0.sites import linears
 
 PI05 = Family(
     "pi05",
@@ -16,8 +17,9 @@ PI05 = Family(
     marks=("time_mlp_in", "time_mlp_", "expert.norm.dense."),
     state_step="pi05_prepare_state_tokenizer_processor_step",
     prompt_tokens=200,
+    linears=linears,
 )
-PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False)
+PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False, linears=None)
 PI05_STATE_MEMORY = replace(PI05_VISUAL_MEMORY, state_in_prefix=True)
 PI0 = Family(
     "pi0",
@@ -29,4 +31,5 @@ PI0 = Family(
     marks=("state_proj", "action_time_mlp_"),
     state_step=None,
     prompt_tokens=48,
+    linears=linears,
 )

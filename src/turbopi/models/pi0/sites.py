@@ -6,12 +6,11 @@ from typing import Any
 from torch import nn
 
 from turbopi.models.pi0.layers import AdaRMSNorm
-from turbopi.models.pi0.reference import Pi0Model
 from turbopi.quantization.sites import Part, Site
 
 
-def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
-    """The reference's matrices of a site."""
+def linears(model: Any, site: Site) -> Iterator[nn.Linear]:
+    """The matrices of a site, of Pi0's reference or one whose modules are called alike."""
     stacks: dict[Part, Any] = {"vision": model.vision, "prefix": model.vlm, "expert": model.expert}
     stack = stacks[site.part]
     layer = stack.layers[site.layer]
@@ -28,7 +27,7 @@ def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
     yield from found[1:] if site.last else found  # nothing asks for the last layer's queries
 
 
-def norm_of(model: Pi0Model, site: Site) -> AdaRMSNorm | None:
+def norm_of(model: Any, site: Site) -> AdaRMSNorm | None:
     """The adaRMS norm inside which a site's activation is, or None: then it is what the matrices read."""
     if site.part != "expert" or site.kind not in ("qkv", "gate_up"):
         return None

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from turbopi.config import Kind, TimeRounding, VisionConfig
+from turbopi.config import GemmaConfig, Kind, TimeRounding, VisionConfig
 
 ElementType = Literal["float32", "bfloat16"]
 
@@ -75,6 +75,23 @@ class SmolVLAConfig:
 
     kind: ClassVar[Kind] = "smolvla"
     time_grid: ClassVar[TimeRounding] = "multiplied"
+    expert_inputs: ClassVar[bool] = False
+
+    @property
+    def vlm(self) -> GemmaConfig:
+        """The text layers' sizes, and `expert` the expert's, as the engine and `quantization.sites` read them."""
+        return self._stack(self.text.width, self.text.mlp_dim, self.text.depth)
+
+    @property
+    def expert(self) -> GemmaConfig:
+        return self._stack(self.expert_width, self.expert_mlp, self.expert_depth)
+
+    def _stack(self, width: int, mlp_dim: int, depth: int) -> GemmaConfig:
+        return GemmaConfig(width, mlp_dim, depth, self.text.num_heads, self.text.num_kv_heads, self.text.head_dim)
+
+    @property
+    def last_read(self) -> int:
+        return self.expert_at[-1]
 
     @property
     def vocab_size(self) -> int:

@@ -5,6 +5,7 @@ from turbopi.models.family import Family
 from turbopi.models.smolvla.config import ElementTypes, SmolVLAConfig
 from turbopi.models.smolvla.names import parameter_dtype
 from turbopi.models.smolvla.reference import SmolVLAModel
+from turbopi.models.smolvla.sites import linears
 from turbopi.models.smolvla.work import counts
 
 BASE = PolicyConfig(  # as lerobot/smolvla_base, but for the robot: for random weights
@@ -30,4 +31,5 @@ SMOLVLA = Family(
     state_in_prefix=True,
     paligemma=False,
     counts=counts,
+    linears=linears,
 )

@@ -115,8 +115,9 @@ __device__ __forceinline__ u32 two_of_int8(u32 four) {
 }
 // The weights that meet a piece of the activations: a lane's 16 bytes, of int8 half of them. Four int8 lie in the order 0,
 // 2, 1, 3.
+template <bool WHOLE>
 __device__ __forceinline__ uint4 piece_of_weights(uint4 w, int piece) {
-  if (!INT8) return w;
+  if (!WHOLE) return w;
   const u32 first = piece ? w.z : w.x, second = piece ? w.w : w.y;
   return make_uint4(two_of_int8(first), two_of_int8(first >> 8), two_of_int8(second), two_of_int8(second >> 8));
 }

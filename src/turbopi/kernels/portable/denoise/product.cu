@@ -50,17 +50,17 @@ struct Product {
 #pragma unroll
     for (int n = 0; n < S::IN_FLIGHT; ++n) w[n] = load(0, n);
   }
-  __device__ __forceinline__ void load_chunk(uint4 (&a)[S::GROUPS][PIECES], const byte* activation, int chunk) const {
+  __device__ __forceinline__ void load_chunk(uint4 (&a)[S::GROUPS][S::PARTS], const byte* activation, int chunk) const {
     const int lane = thread % 32, at = first_chunk() + chunk;
     const bool there = S::CHUNKS % S::WK == 0 || at < S::CHUNKS;
 #pragma unroll
     for (int group = 0; group < S::GROUPS; ++group) {
       const int token = from() + group * 8 + lane / 4;
 #pragma unroll
-      for (int piece = 0; piece < PIECES; ++piece) {
+      for (int piece = 0; piece < S::PARTS; ++piece) {
         a[group][piece] = make_uint4(0, 0, 0, 0);
         if (there && token < T && (S::RANGES == 1 || token < from() + S::RANGE))
-          a[group][piece] = load_shared_by_grid(activation + ((at * PIECES + piece) * T + token) * 64 + lane % 4 * 16);
+          a[group][piece] = load_shared_by_grid(activation + ((at * S::PARTS + piece) * T + token) * 64 + lane % 4 * 16);
       }
     }
   }
@@ -80,7 +80,7 @@ struct Product {
     grid.wait();
     if ((S::TILES < S::PARTIES || S::LEFT_OUT) && first == end) return;  // it would load all activations for nothing
     meanwhile.ask(thread, from());
-    uint4 a[S::A_IN_FLIGHT][S::GROUPS][PIECES];
+    uint4 a[S::A_IN_FLIGHT][S::GROUPS][S::PARTS];
     for (int pass = 0; pass < S::PASSES; ++pass) {
       if (S::PASSES > 1) thread = of_phase(thread), first = of_phase(first), end = of_phase(end);
       if (pass == 0 || S::A_IN_FLIGHT < S::WARP_CHUNKS) {
@@ -91,13 +91,13 @@ struct Product {
       float c[S::WARP_TILES][S::M_TILES][4] = {};
 #pragma unroll
       for (int chunk = 0; chunk < S::WARP_CHUNKS; ++chunk) {
-        uint4(&here)[S::GROUPS][PIECES] = a[chunk % S::A_IN_FLIGHT];
+        uint4(&here)[S::GROUPS][S::PARTS] = a[chunk % S::A_IN_FLIGHT];
 #pragma unroll
         for (int tile = 0; tile < S::WARP_TILES; ++tile) {
           const int n = chunk * S::WARP_TILES + tile, next = n + S::IN_FLIGHT;
 #pragma unroll
-          for (int piece = 0; piece < PIECES; ++piece) {
-            const uint4 b = piece_of_weights(w[n % S::IN_FLIGHT], piece);
+          for (int piece = 0; piece < S::PARTS; ++piece) {
+            const uint4 b = piece_of_weights<S::WHOLE>(w[n % S::IN_FLIGHT], piece);
 #pragma unroll
             for (int m = 0; m < S::M_TILES; ++m) {
               const uint4 none = make_uint4(0, 0, 0, 0);

@@ -71,11 +71,14 @@ constexpr __host__ __device__ int power_of_two(int up_to, int limit) {  // the l
 }
 
 // A product's shape and how warps share it out. RANGES_: tokens are cut into so many; a block has tiles for one of them.
-// PARTIES_: of blocks with the same tiles. IN_FLIGHT_: loads of weights that a lane has on their way, at most.
-template <int CHANNELS_, int COLUMNS_, int RANGES_ = 1, int PARTIES_ = BLOCKS / RANGES_, int IN_FLIGHT_ = TP_WEIGHTS_IN_FLIGHT>
+// PARTIES_: of blocks with the same tiles. IN_FLIGHT_: loads of weights that a lane has on their way, at most. INT8_: whether
+// the weights are int8.
+template <int CHANNELS_, int COLUMNS_, int RANGES_ = 1, int PARTIES_ = BLOCKS / RANGES_, int IN_FLIGHT_ = TP_WEIGHTS_IN_FLIGHT,
+          bool INT8_ = INT8>
 struct Shape {
-  static constexpr int TILES = CHANNELS_ / 8;
-  static constexpr int CHUNKS = (COLUMNS_ + CHUNK - 1) / CHUNK;
+  static constexpr bool WHOLE = INT8_;
+  static constexpr int TILES = CHANNELS_ / 8, PARTS = WHOLE ? PIECES : 1;  // pieces of a chunk
+  static constexpr int CHUNKS = (COLUMNS_ + PARTS * PIECE - 1) / (PARTS * PIECE);
   static constexpr int RANGES = RANGES_, RANGE = (T + RANGES - 1) / RANGES;        // tokens
   static constexpr int GROUPS = (RANGE + 7) / 8, M_TILES = (RANGE + 15) / 16;      // of 8 and of 16 of them
   static constexpr int PARTIES = PARTIES_, BLOCK_TILES = (TILES + PARTIES - 1) / PARTIES;  // of a block at most
@@ -91,7 +94,7 @@ struct Shape {
   static constexpr int WARP_CHUNKS = (CHUNKS + WK - 1) / WK;
   static constexpr int LOADS = WARP_CHUNKS * WARP_TILES;  // of a lane, in a pass
   static constexpr int IN_FLIGHT = divisor(LOADS, IN_FLIGHT_);
-  static constexpr int A_ROOM = TP_ACTIVATIONS_IN_FLIGHT / (GROUPS * PIECES), A_WANTED = A_ROOM < 1 ? 1 : A_ROOM;
+  static constexpr int A_ROOM = TP_ACTIVATIONS_IN_FLIGHT / (GROUPS * PARTS), A_WANTED = A_ROOM < 1 ? 1 : A_ROOM;
   static constexpr int A_IN_FLIGHT = A_WANTED < WARP_CHUNKS ? A_WANTED : WARP_CHUNKS;  // chunks
   static constexpr int SUM_ROWS = RANGES > 1 ? RANGE : GROUPS * 8, SUM_WORDS = WK * PASS_TILES * SUM_ROWS * 8;
   static constexpr long long BYTES = (long long)TILES * CHUNKS * CHUNK_BYTES;
@@ -100,7 +103,8 @@ using QkvShape = Shape<QKV_ROWS, D, TP_WIDE_RANGES>;
 using OutShape = Shape<D, HEADS * HD, TP_RANGES>;
 using GateUpShape = Shape<2 * F, D, TP_WIDE_RANGES>;
 using DownShape = Shape<D, F, TP_RANGES>;
-using MixShape = Shape<D, D, TP_RANGES>;
+using MixShape = Shape<D, D, TP_RANGES, BLOCKS / TP_RANGES, TP_WEIGHTS_IN_FLIGHT, false>;  // bfloat16 beside int8, too
+static_assert(MODULATED || !FP8, "the mixed tokens' operands are bfloat16");
 // Across at once: a block has a head for up to 8 tokens. Keys and values are on their way beside the weights: half as many
 using QueriesShape = Shape<HEADS * HD, D, (T + 7) / 8, HEADS, TP_WEIGHTS_IN_FLIGHT / 2>;
 using EmbedShape = Shape<D, F>;  // how a step's first phase shares out columns
