@@ -66,7 +66,7 @@ def rounded_on_cpu(made: SmolVLAModel, format: Format) -> tuple[dict[Site, float
 def test_the_plan_equals_the_emulated_reference(
     which: str, format: Format, on_cpu: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("grouped_attention", "swiglu"):  # the interpreter can't round to E4M3: the plain way does
+    for name in ("grouped_attention", "swiglu") if format is FP8 else ():  # which Triton's interpreter can't round to
 
         def plainly(kernel: Any, *given: Any, **to: Any) -> Tensor:
             return as_input(kernel(*given), torch.float32, **{"inverse": None, "numbers": E4M3} | to)
