@@ -19,9 +19,11 @@ DECODED = DEVICE.type == "cpu" or nvfp4_refusal(torch.cuda.get_device_capability
 pytestmark = gpu_or_interpreter()
 
 
-def test_the_kernels_are_right_beside_their_emulation() -> None:
+def test_the_kernels_are_right_beside_their_emulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = [("plain", 130, 144, 40), ("gelu", 20, 256, 136), ("geglu", 9, 128, 72)]
+    monkeypatch.setattr(four_bits, "_CASES", four_bits._CASES if DEVICE.type == "cuda" else small)
     why, errors = four_bits.check_four_bits(DEVICE, decoded=DECODED)
-    assert why is None and len(errors) == 4 and max(errors.values()) < 1e-5
+    assert why is None and len(errors) == len(four_bits._CASES) and max(errors.values()) < 1e-5
 
 
 def swizzled(matrix: Nvfp4Matrix) -> Nvfp4Matrix:
@@ -41,12 +43,12 @@ def swizzled(matrix: Nvfp4Matrix) -> Nvfp4Matrix:
 def test_a_fault_is_found(fault: Callable[..., Any], says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     right = four_bits.product
     monkeypatch.setattr(four_bits, "product", lambda *given, **named: fault(right, *given, **named))
-    monkeypatch.setattr(four_bits, "_CASES", four_bits._CASES[2:3])
+    monkeypatch.setattr(four_bits, "_CASES", [("gelu", 9, 256, 40)])
     why, _ = four_bits.check_four_bits(DEVICE, decoded=DECODED)
     assert why is not None and says in why
 
 
 def test_an_activation_that_is_rounded_otherwise_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(four_bits, "round_blocks", lambda x, *given: round_blocks(x * 1.01, *given))
-    monkeypatch.setattr(four_bits, "_CASES", four_bits._CASES[2:3])
+    monkeypatch.setattr(four_bits, "_CASES", [("gelu", 9, 256, 40)])
     assert "aren't rounded" in str(four_bits.check_four_bits(DEVICE, decoded=DECODED)[0])

@@ -38,7 +38,6 @@ RACED = ("fused", "cuda_graph")
 QUALIFIED = " *"  # behind what `auto` takes where it isn't qualified: then it may be `fused`
 REPORTS = "qualified/*.json"  # as users' machines wrote them
 TIERS: tuple[Precision, ...] = ("bf16", "fp8", "int8")
-REFUSED: tuple[Precision, ...] = (*TIERS, "nvfp4")  # somewhere
 
 
 @contextmanager
@@ -81,10 +80,10 @@ def refusals(gpu: GpuSpec) -> dict[str, str]:
     """What is refused on a GPU -> why, in the backends' words."""
     found = {}
     with pretended(gpu):
-        for precision in REFUSED:
+        for precision in TIERS:
             name = backends.choose(DEVICE, precision)[0]
             try:
-                backends.check(name, DEVICE, precision, ModelConfig())
+                backends.check(name, DEVICE, precision)
             except TurboPiError as error:
                 found[f"{precision}: refused"] = str(error).partition(f" on {DEVICE}: ")[2] or str(error)
     return found

@@ -161,7 +161,7 @@ def check_grid(subject: Subject) -> Figures:
 def check_kernels(subject: Subject, checkpoint: Checkpoint, quantization: Quantization | None) -> Comparison:
     """Every operation of a call beside PyTorch's, then a batch beside its single calls; before them NVFP4's kernels."""
     if subject.precision == "nvfp4":
-        subject.at("products in NVFP4", "", COMPILING)
+        subject.at("matmuls in NVFP4", "", COMPILING)
         why, _ = check_four_bits(subject.device)
         if why is not None:
             raise Faulty(why)
