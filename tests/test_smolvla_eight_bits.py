@@ -27,7 +27,7 @@ from turbopi.kernels.plain import PLAIN, as_input
 from turbopi.models.observation import Observation
 from turbopi.models.smolvla.reference import SmolVLAModel
 from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
-from turbopi.quantization.formats import OF_EIGHT_BITS, FP8, INT8, Format
+from turbopi.quantization.formats import FP8, INT8, OF_EIGHT_BITS, Format
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 from turbopi.quantization.sites import Site, sites
 from turbopi.support.errors import CalibrationError, ConfigError
