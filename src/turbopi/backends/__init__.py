@@ -222,7 +222,7 @@ def choose(
         untried = _untried(device, precision, model) if on_gpu else None
         slow = on_gpu and precision == "int8" and torch.cuda.get_device_capability(device) == (9, 0)
         slow = slow and (model is None or family_of(model).planned)  # measured of these alone
-        said = [f"the fast one of those that run in {precision}", untried, "fp8 and bf16 are quicker here" * slow]
+        said = [f"the fast one of those that run in {precision}", untried, "fp8 is quicker here" * slow]
         return "fused", f"auto: {'; '.join(one for one in said if one)}"
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
