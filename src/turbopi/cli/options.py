@@ -232,8 +232,7 @@ class PolicyOptions(RobotOptions):
             "--quantization",
             panel=_RUNNING,
             metavar="FILE",
-            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json, or _int8, _nvfp4, beside the "
-            "weights.",
+            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json and the like beside the weights.",
         ),
     ] = None
     fp8_parts: Annotated[

@@ -43,9 +43,7 @@ Settings = Annotated[
 ]
 PrintSettings = Annotated[
     bool,
-    typer.Option(
-        "--print-settings", rich_help_panel="Settings", help="Print all options as such a file, and start nothing."
-    ),
+    typer.Option("--print-settings", rich_help_panel="Settings", help="Print all options so; start nothing."),
 ]
 
 
