@@ -1,7 +1,7 @@
 """NVFP4's kernels beside the emulation: exact where numbers are rounded, to float32's rounding where they are added.
 
-In the interpreter, and on GPUs without the instruction, the product decodes the same bytes. On a GPU that has it
-`turbopi doctor --qualify` compares the same.
+In the interpreter the product decodes the same bytes. On a GPU that has the instruction `turbopi doctor --qualify`
+compares the same.
 """
 
 from dataclasses import replace
@@ -23,7 +23,8 @@ from turbopi.quantization.nvfp4 import BLOCK, Nvfp4Matrix
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 pytestmark = gpu_or_interpreter()
-NATIVE = torch.cuda.is_available() and nvfp4_refusal(torch.cuda.get_device_capability()) is None
+WITHOUT = torch.cuda.is_available() and nvfp4_refusal(torch.cuda.get_device_capability()) is not None
+where_it_is = pytest.mark.skipif(WITHOUT, reason="this GPU hasn't the instruction")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -49,6 +50,7 @@ def activated(epilogue: str, product: Tensor) -> Tensor:
     return {"plain": lambda x: x, "gelu": plain.gelu, "geglu": plain.geglu}[epilogue](product)
 
 
+@where_it_is
 @pytest.mark.parametrize(
     ("epilogue", "rows", "inner", "out"),
     [("plain", 5, 48, 40), ("gelu", 130, 144, 200), ("geglu", 20, 256, 136), ("geglu", 3, 128, 40)],
@@ -60,14 +62,14 @@ def test_a_product_is_the_emulations(epilogue: kernels.Epilogue, rows: int, inne
     x = random(rows, inner, seed=2).bfloat16()
     x[2, 3] = float("nan")
     exact = activated(epilogue, matrix.product(x, bias))
-    found = kernels.product(x, matrix, epilogue, bias, decoded=not NATIVE)
+    found = kernels.product(x, matrix, epilogue, bias)
     assert found[2].isnan().all() and not found[[0, 1]].isnan().any()
     torch.testing.assert_close(
         found, exact, rtol=1e-5, atol=1e-6 * float(exact.nan_to_num().abs().max()), equal_nan=True
     )
 
 
-@pytest.mark.skipif(DEVICE.type == "cuda" and not NATIVE, reason="this GPU hasn't the instruction")
+@where_it_is
 def test_operations_take_it_beside_other_matrices() -> None:
     ops, x, weight, bias = kernels.in_nvfp4(portable_ops()), *(random(*one) for one in ((4, 64), (32, 64), (32,)))
     x, weight, bias = x.bfloat16(), weight.bfloat16(), bias.bfloat16()

@@ -24,8 +24,8 @@ _CASES: tuple[tuple[Epilogue, int, int, int], ...] = (
 _SCALE = 0.002  # of the activations' tensor: the largest block's scale saturates
 
 
-def check_four_bits(device: torch.device, *, decoded: bool | None = None) -> tuple[str | None, dict[str, float]]:
-    """(what isn't right, in words; None: all is; the relative rms error by case). decoded: of `product`."""
+def check_four_bits(device: torch.device) -> tuple[str | None, dict[str, float]]:
+    """(what isn't right, in words; None: all is; the relative rms error by case)."""
     errors: dict[str, float] = {}
     for epilogue, tokens, inner, out in _CASES:
         name = f"{epilogue} [{tokens}, {inner}] x {out}"
@@ -47,7 +47,7 @@ def check_four_bits(device: torch.device, *, decoded: bool | None = None) -> tup
         assert codes.shape[1] == whole(inner) // 2
         expected = matrix.product(x, bias)
         expected = {"plain": lambda y: y, "gelu": plain.gelu, "geglu": plain.geglu}[epilogue](expected)
-        found = product(x, matrix, epilogue, bias, decoded=decoded)
+        found = product(x, matrix, epilogue, bias)
         if not torch.equal(found.isnan(), expected.isnan()):
             return f"a NaN of {name} doesn't stay in its row, and nowhere else", errors
         found, expected = found.nan_to_num(), expected.nan_to_num()

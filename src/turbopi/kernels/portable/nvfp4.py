@@ -94,7 +94,7 @@ def _decoded(codes, blocks, ROWS: tl.constexpr, DEPTH: tl.constexpr):
 
 @triton.jit
 def _sum(a, a_blocks, b, b_blocks, acc, DECODED: tl.constexpr):
-    """acc + a bᵀ"""
+    """acc + a bᵀ. DECODED: without the instruction, as Triton's interpreter hasn't it."""
     if DECODED:
         a = _decoded(a, a_blocks, a.shape[0], 2 * a.shape[1])
         b = _decoded(b, b_blocks, b.shape[0], 2 * b.shape[1])
@@ -149,13 +149,10 @@ def product(
     epilogue: Epilogue = "plain",
     bias: Tensor | None = None,
     out: Tensor | None = None,
-    *,
-    decoded: bool | None = None,
 ) -> Tensor:
     """x [tokens, in] @ weightᵀ + bias, then the epilogue -> [tokens, out] in the weight's dtype.
 
     x isn't rounded yet. weight [out, in], of "geglu" [2 * out, in], gate rows before up rows; bias [out].
-    decoded: the same products and sums without the instruction, slowly, on any GPU; None: in Triton's interpreter.
     """
     codes, blocks = round_activation(x, weight.input_scale)
     rows, wide = len(x), whole(weight.inner)
@@ -171,7 +168,7 @@ def product(
         codes, blocks.view(torch.uint8), weight.codes, weight.blocks.view(torch.uint8), weight.scale,
         x if bias is None else bias, out, rows, columns, wide, weight.input_scale,
         GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None,
-        DECODED=not x.is_cuda if decoded is None else decoded, BLOCK_M=ROWS, BLOCK_N=COLUMNS,
+        DECODED=not x.is_cuda, BLOCK_M=ROWS, BLOCK_N=COLUMNS,
         **_options(x, wide), **dependent_launch(x),
     )  # fmt: skip
     return out
