@@ -152,3 +152,8 @@ def test_a_folder_is_calibrated_and_runs_by_what_lies_beside_it(
         UnifiedPolicy(folder, backend="cuda_graph", precision=numbers, device="cpu")
     refused = turbopi("convert", folder, tmp_path / "out", "--precision", numbers)
     assert "engines or conversions of a smolvla" in refusal(refused)
+    refused = turbopi("calibrate", folder, "--precision", "nvfp4", *given)
+    assert "SmolVLA doesn't run in NVFP4: calibrate it for fp8 or int8" in refusal(refused)
+    for precision in ("nvfp4", "fp8-f16sums"):
+        with pytest.raises(ConfigError, match=f"'fused' runs SmolVLA in bf16 or .* alone, not in '{precision}'"):
+            UnifiedPolicy(folder, backend="fused", precision=precision, device="cpu")

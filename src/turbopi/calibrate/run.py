@@ -31,7 +31,7 @@ from turbopi.policy.examples import NoisyExample, with_noises
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
-from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.formats import FP8, OF_EIGHT_BITS, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.plan import HALF_SUMS, refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
@@ -68,10 +68,13 @@ class Progress:
     advance: Callable[[], None] = field(default=lambda: None)
 
 
-def check_family(checkpoint: Checkpoint) -> None:
-    """Raise ConfigError for a model that no calibration is for, before anything else is read."""
-    if (family := family_of(checkpoint.config.model)).linears is not None:
+def check_family(checkpoint: Checkpoint, format: Format) -> None:
+    """Raise ConfigError for a model that no calibration in this format is for, before anything else is read."""
+    family = family_of(checkpoint.config.model)
+    if family.planned or (family.linears is not None and format.name in OF_EIGHT_BITS):
         return
+    if family.linears is not None:
+        raise ConfigError(f"{family.label} doesn't run in {format.label}: calibrate it for fp8 or int8")
     names = ", ".join(one.label for one in FAMILIES.values() if one.linears is not None)
     other = ", or on an NVIDIA GPU in 'int8-weights', which needs none" if family.reader is not None else ""
     raise ConfigError(
@@ -87,7 +90,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     reference itself isn't finite.
     """
     progress, started = progress or Progress(), time.perf_counter()
-    check_family(checkpoint)
+    check_family(checkpoint, settings.format)
     if settings.arguments.get("robot") is None:
         checkpoint = shipped.with_libero_stats(checkpoint)
     arguments = dict(settings.arguments) | {"backend": "pytorch", "precision": "f32"}

@@ -111,7 +111,7 @@ def calibrate(
     from turbopi.calibrate.run import calibrate as run
     from turbopi.checkpoint.calibration import BESIDE
 
-    check_family(opened)
+    check_family(opened, format)
     if out is None and (checkpoint is None or options.random_weights is not None):
         raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
     out = out or Path(str(checkpoint)) / BESIDE[format.name]

@@ -69,8 +69,8 @@ class UnifiedPolicy:
             or the `turbopi.json` beside the weights.
         backend: a name from `turbopi doctor`; "auto" takes the fastest one available (see `metadata`), and
             qualifies a GPU that it doesn't know, once, in at most a minute (docs/gpus.md).
-        precision: "bf16", "f32", "int8-weights" for Pi0-FAST, or with a calibration "fp8", "fp8-mlp", "fp8-f16sums" or
-            "int8" (docs/quantization.md). None: what the folder keeps its weights in, else bf16.
+        precision: "bf16", "f32", "int8-weights" for Pi0-FAST, or with a calibration "fp8", "fp8-mlp", "fp8-f16sums",
+            "int8" or "nvfp4" (docs/quantization.md). None: what the folder keeps its weights in, else bf16.
         quantization: the file that `turbopi calibrate` wrote. None: the one beside the weights.
         num_denoising_steps: evaluations of the action expert in a call. None: the config's.
         solver: "euler", "midpoint", "heun", "ab2" or "exponential" (docs/performance.md). None: the config's.
