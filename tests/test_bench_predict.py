@@ -240,6 +240,11 @@ def test_a_smaller_model_has_a_floor_and_no_call() -> None:
         assert one.calls == []
 
 
+def test_a_gpu_is_found_by_its_name_in_the_table() -> None:
+    for gpu in published_gpus().values():
+        assert find_gpu(gpu.name) == find_gpu(gpu.key) == gpu
+
+
 @pytest.mark.parametrize("typed", ["rtx4090", "RTX 4090", "GeForce RTX 4090", "nvidia geforce rtx-4090"])
 def test_a_gpu_is_found_as_people_write_it(typed: str) -> None:
     assert find_gpu(typed).key == "rtx4090"

@@ -490,11 +490,21 @@ def test_each_precision_finds_its_own_file_beside_the_weights(tmp_path: Path) ->
 def test_float16_sums_need_a_calibration_that_measured_and_allows_them() -> None:
     with pytest.raises(ConfigError, match="is older than fp8-f16sums; run `turbopi calibrate` again or take 'fp8'"):
         made_up().plan(TINY, "fp8-f16sums")
-    for rms, cosine, allowed in ((0.14, 0.99, True), (0.2, 0.998, True), (0.2, 0.99, False), (np.nan, np.nan, False)):
+    for rms, cosine, allowed in ((0.14, 0.99, True), (0.2, 0.998, True), (0.2, 0.99, False)):
         held = {"fp8": {"relative_rms": 0.1}, "fp8-f16sums": {"relative_rms": rms, "delta_cosine": cosine}}
         found = made_up(report={"held_out": held, "target": 0.9975})
         with nullcontext() if allowed else pytest.raises(ConfigError, match="is beyond 0"):
             assert found.plan(TINY, "fp8-f16sums").scales == found.plan(TINY, "fp8").scales
+    right = {"relative_rms": 0.1, "delta_cosine": 0.999}
+    given: Any = {"held_out": {"fp8": right, "fp8-f16sums": right}, "target": 0.9975}
+    with pytest.raises(ConfigError, match="nothing of vision and prefix is left in fp8-f16sums: take 'fp8'"):
+        made_up(report=given).only(["expert"]).plan(TINY, "fp8-f16sums")
+    damaged: list[tuple[Any, Any]] = [("x", 0.9975), ({"fp8-f16sums": right}, 0.9975), (given["held_out"], None)]
+    halves: list[Any] = [[], {}, "x", None, {**right, "delta_cosine": "x"}]
+    damaged += [({"fp8": right, "fp8-f16sums": half}, 0.9975) for half in halves]
+    for report, target in damaged:
+        with pytest.raises(CalibrationError, match="doesn't say what fp8-f16sums costs: its report is damaged"):
+            made_up(report={"held_out": report, "target": target}).plan(TINY, "fp8-f16sums")
 
 
 def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:

@@ -3,6 +3,7 @@
 Without a GPU: graphs run again on a CPU in float32, kernels by Triton's interpreter.
 """
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -155,5 +156,10 @@ def test_a_folder_is_calibrated_and_runs_by_what_lies_beside_it(
     refused = turbopi("calibrate", folder, "--precision", "nvfp4", *given)
     assert "SmolVLA doesn't run in NVFP4: calibrate it for fp8 or int8" in refusal(refused)
     for precision in ("nvfp4", "fp8-f16sums"):
-        with pytest.raises(ConfigError, match=f"'fused' runs SmolVLA in bf16 or .* alone, not in '{precision}'"):
-            UnifiedPolicy(folder, backend="fused", precision=precision, device="cpu")
+        backend = f"emulated_{'nvfp4' if precision == 'nvfp4' else 'fp8'}"
+        with pytest.raises(ConfigError, match=f"precision '{precision}' isn't for SmolVLA; take precision 'bf16'"):
+            UnifiedPolicy(folder, backend=backend, precision=precision, device="cpu")
+    found = json.loads(turbopi("doctor", "--checkpoint", folder, "--json").stdout)
+    listed = {one["name"]: one for one in found["backends"]}
+    assert listed["fused"]["precisions"] == ["bf16", "fp8", "fp8-mlp", "int8"]
+    assert not listed["emulated_nvfp4"]["available"]

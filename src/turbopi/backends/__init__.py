@@ -335,12 +335,8 @@ def check(
         if precision == WEIGHTS_ALONE:
             where = "models that write their actions as tokens do, in backend 'cuda_graph' on an NVIDIA GPU"
         raise ConfigError(f"backend {name!r} doesn't run in {precision!r}: {where}")
-    if given is not None:
-        if precision not in (its := class_for(name, given).precisions):
-            what = f"{family_of(given).label} in {' or '.join(its)} alone, not in {precision!r}"
-            raise ConfigError(f"backend {name!r} runs {what}")
-        if (why := class_for(name, given).refuses_model(given)) is not None:
-            raise BackendUnavailable(why)
+    if given is not None and (why := class_for(name, given).refuses_model(given)) is not None:
+        raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
     if precision in ROUNDED and reason is not None and device.type != "cuda":
         which = {"int8": "8.x, 9.0 or 12.x", "nvfp4": "10.x, 11.0 or 12.x", HALF_SUMS: "8.9 or 12.x"}
@@ -365,7 +361,7 @@ def _is_for(precision: Precision, model: Network) -> bool:
     family = family_of(model)
     if precision == WEIGHTS_ALONE:
         return family.reader is not None
-    return family.linears is not None or precision not in TIERS
+    return precision in family.tiers or precision not in TIERS
 
 
 def _not_for(precision: Precision, model: Network) -> str:
@@ -412,9 +408,9 @@ def create(
         return cls(config, load, device=device, precision=precision, quantization=quantization)
 
 
-def precisions(name: str) -> tuple[Precision, ...]:
-    """The precisions a backend runs Pi0 and Pi0.5 in."""
-    return class_of(name).precisions
+def precisions(name: str, model: Network | None = None) -> tuple[Precision, ...]:
+    """The precisions a backend runs a model in; None: Pi0 and Pi0.5."""
+    return tuple(one for one in class_of(name).precisions if model is None or _is_for(one, model))
 
 
 def all_precisions(name: str) -> tuple[Precision, ...]:

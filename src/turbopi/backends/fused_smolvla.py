@@ -81,7 +81,7 @@ class FusedSmolVLABackend(CapturedBackend):
         if (refused := super().refuses_model(config)) is not None:
             return refused
         why = smolvla.refusal(config)
-        return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'auto'"
+        return None if why is None else f"backend 'fused' can't run this SmolVLA: {why}; take backend 'auto' in 'bf16'"
 
     def load_weights(self, load: LoadState) -> None:
         given = self._quantization

@@ -56,10 +56,17 @@ def published_gpus() -> dict[str, GpuSpec]:
 
 def find_gpu(name: str) -> GpuSpec:
     """The GPU that a user means: "rtx4090", "RTX 4090" and "GeForce RTX 4090" are one. Raises ConfigError."""
-    typed = re.sub(r"[^a-z0-9]", "", name.lower())
-    for word in ("nvidia", "geforce", "jetsonagx", "jetson"):
-        typed = typed.removeprefix(word)
-    known = published_gpus()
+
+    def plain(text: str) -> str:
+        short = re.sub(r"[^a-z0-9]", "", text.lower())
+        for word in ("nvidia", "geforce", "jetsonagx", "jetson"):
+            short = short.removeprefix(word)
+        return short
+
+    known, typed = published_gpus(), plain(name)
+    by_name = {plain(spec.name): spec for spec in known.values()}
+    if typed in by_name:
+        return by_name[typed]
     if typed not in known:
         raise ConfigError(
             f"no published numbers of a GPU {shown(name)} are known here; {names_known(typed, 'known are', known)}. "

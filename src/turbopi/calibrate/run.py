@@ -31,9 +31,9 @@ from turbopi.policy.examples import NoisyExample, with_noises
 from turbopi.policy.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
-from turbopi.quantization.formats import FP8, OF_EIGHT_BITS, Format
+from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
-from turbopi.quantization.plan import HALF_SUMS, refusal
+from turbopi.quantization.plan import HALF_SUMS, format_of, refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.support.errors import CheckpointError, ConfigError
 from turbopi.support.reading import plain_document
@@ -71,11 +71,13 @@ class Progress:
 def check_family(checkpoint: Checkpoint, format: Format) -> None:
     """Raise ConfigError for a model that no calibration in this format is for, before anything else is read."""
     family = family_of(checkpoint.config.model)
-    if family.planned or (family.linears is not None and format.name in OF_EIGHT_BITS):
+    formats = dict.fromkeys(format_of(tier) for tier in family.tiers)
+    if format in formats:
         return
-    if family.linears is not None:
-        raise ConfigError(f"{family.label} doesn't run in {format.label}: calibrate it for fp8 or int8")
-    names = ", ".join(one.label for one in FAMILIES.values() if one.linears is not None)
+    if formats:
+        others = " or ".join(one.name for one in formats)
+        raise ConfigError(f"{family.label} doesn't run in {format.label}: calibrate it for {others}")
+    names = ", ".join(one.label for one in FAMILIES.values() if one.tiers)
     other = ", or on an NVIDIA GPU in 'int8-weights', which needs none" if family.reader is not None else ""
     raise ConfigError(
         f"calibrations are for {names} alone, and {checkpoint.config.name} is {family.label}: run it in "
@@ -227,6 +229,8 @@ def calibrate_model(
         )
     if reached < settings.target:
         warnings.append(f"the held-out actions' cosine is {reached:.5f}, below the target {settings.target}")
+    elif (half := on_held_out.get(HALF_SUMS, on_held_out[format.name])["delta_cosine"]) < settings.target:
+        warnings.append(f"in {HALF_SUMS} their cosine is {half:.5f}, below the target {settings.target}")
     report = {
         "steps": steps,
         "method": method,
@@ -410,7 +414,8 @@ def _held_out(
     name = trials.format.name
     cases: dict[str, dict[Site, float]] = {name: used}
     if name == "fp8":
-        cases[HALF_SUMS] = used
+        if HALF_SUMS in family_of(model.config).tiers:
+            cases[HALF_SUMS] = used
         cases["fp8-mlp"] = {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"}
     for part in trials.format.parts:
         cases[f"{name} in the {part} alone"] = {s: used[s] for s in used if s.part == part}

@@ -76,6 +76,6 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
 
 def _sizes(checkpoint: Checkpoint) -> Any:
     """Raises ConfigError for a model that no calibration is for."""
-    if (family := family_of(checkpoint.config.model)).linears is None:
+    if not (family := family_of(checkpoint.config.model)).tiers:
         raise ConfigError(f"{checkpoint.config.name} is {family.label}, which has no calibrations; take 'bf16'")
     return checkpoint.config.model

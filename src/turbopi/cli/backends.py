@@ -72,7 +72,7 @@ def list_backends(device: str, precision: str, checkpoint: "Checkpoint | None" =
             "name": spec.name,
             "available": (reason := _why_not(spec.name, resolved, tier, checkpoint)) is None,
             "reason": reason,
-            "precisions": list(registry.precisions(spec.name)),
+            "precisions": list(registry.precisions(spec.name, None if checkpoint is None else checkpoint.config.model)),
             "summary": spec.summary,
             "auto": spec.name == chosen,
         }
@@ -97,7 +97,7 @@ def _why_not(name: str, device: "torch.device", tier: "Precision", checkpoint: "
         return f"the folder keeps its weights in {kept}, which backend 'fused' alone runs"
     if (reason := backends.availability(name, device)) is not None or checkpoint is None:
         return reason
-    own = backends.precisions(name)
+    own = backends.precisions(name, checkpoint.config.model) or backends.precisions(name)
     return backends.refusal(name, device, tier if tier in own else own[0], checkpoint.config.model)
 
 

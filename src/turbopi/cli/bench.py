@@ -218,9 +218,7 @@ def bench(
     profile: Annotated[bool, typer.Option("--profile", help="Name the kernels that take longest, by stage.")] = False,
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
-    quantization: Annotated[
-        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for FP8 or INT8.")
-    ] = None,
+    quantization: Annotated[str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote.")] = None,
     predict: Annotated[
         str | None,
         typer.Option(

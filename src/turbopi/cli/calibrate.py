@@ -102,10 +102,12 @@ def calibrate(
     """
     output = Output(as_json)
     from turbopi.quantization.formats import FORMATS
+    from turbopi.quantization.plan import FP8_TIERS
 
     format = next((one for one in FORMATS.values() if one.name == precision), None)
     if format is None:
-        raise ConfigError(f"--precision {precision!r} isn't what calibration is for; choose {' or '.join(FORMATS)}")
+        why = "calibrate for fp8, whose file it takes" if precision in FP8_TIERS else f"choose {' or '.join(FORMATS)}"
+        raise ConfigError(f"--precision {precision!r} isn't what calibration is for; {why}")
     opened = options.open(checkpoint)
     from turbopi.calibrate.run import Progress, Settings, check_family
     from turbopi.calibrate.run import calibrate as run

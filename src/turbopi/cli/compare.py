@@ -51,9 +51,7 @@ def compare_command(
     ] = "libero",
     across_calibrations: Annotated[
         bool,
-        typer.Option(
-            "--across-calibrations", help="FP8 or INT8 runs of the same weights may have different calibrations."
-        ),
+        typer.Option("--across-calibrations", help="Runs of the same weights may have different calibrations."),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
@@ -174,7 +172,7 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
         checked_steps(variant.steps, ConfigError)
         check_backend(variant.backend, device, variant.precision, checkpoint)  # type: ignore[arg-type]  # parsed
     if not tiers and (options.quantization is not None or options.fp8_parts is not None):
-        raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8 or INT8, and none of these is")
+        raise ConfigError("--quantization and --fp8-parts are for ways to run with a calibration, and none of these is")
     for tier in tiers:
         calibration_of(options.policy_arguments()["quantization"], tier, checkpoint)
 

@@ -241,7 +241,7 @@ class PolicyOptions(RobotOptions):
             "--fp8-parts",
             panel=_RUNNING,
             metavar="PART,PART",
-            help="FP8 or INT8 in these parts alone: vision, prefix, expert. Unless given, all that calibration allows.",
+            help="Calibrated in these parts alone: vision, prefix, expert. Unless given, all that calibration allows.",
         ),
     ] = None
     steps: Annotated[

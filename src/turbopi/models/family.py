@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from turbopi.config import FloatPrecision, Kind
+from turbopi.quantization.plan import Tier
 from turbopi.quantization.sites import Site
 
 
@@ -60,7 +61,8 @@ class Family:
 
     planned          whether the engine has a plan for it and its kernels; else backends run the reference
     linears          (reference, site) -> that site's matrices, of which the first one's input is the activation: what
-                     calibration and emulation round. None: it runs in no precision that takes a calibration
+                     calibration and emulation round
+    tiers            the precisions with a calibration that some backend runs it in
     modulated        the time scales, shifts and gates the expert's norms (adaRMS); else it is mixed into the actions'
                      tokens
     state_token      the state is a token before the actions, which it doesn't see; else it is in the prompt, in the
@@ -93,6 +95,7 @@ class Family:
     prompt: Callable[[Any, str, str], str] | None = None
     reader: Callable[[Any, Pieces, Path | None], AnswerReader] | None = None
     linears: Callable[[Any, Site], Iterator[nn.Linear]] | None = None
+    tiers: tuple[Tier, ...] = ()
 
     @property
     def state_in_prompt(self) -> bool:

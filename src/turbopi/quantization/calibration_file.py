@@ -195,15 +195,25 @@ class Quantization:
                     common[str(site)] = entry.directions
             else:
                 kept[str(site)] = reason
-        return PrecisionPlan(tier, chosen, kept, common)
+        plan = PrecisionPlan(tier, chosen, kept, common)
+        if tier == HALF_SUMS and not any(map(plan.has_half_sums, chosen)):
+            raise ConfigError(f"nothing of vision and prefix is left in {HALF_SUMS}: take 'fp8'")
+        return plan
 
     def _check_half_sums(self) -> None:
         """Raise ConfigError unless they were measured, and reach the target or cost next to nothing."""
         held, name = self.report.get("held_out", {}), self.source or "this calibration"
-        if (ours := held.get(HALF_SUMS)) is None:
+        if isinstance(held, Mapping) and HALF_SUMS not in held:
             raise ConfigError(f"{name} is older than {HALF_SUMS}; run `turbopi calibrate` again or take 'fp8'")
-        error, most = ours["relative_rms"], HALF_SUMS_COST * held["fp8"]["relative_rms"]
-        if not (ours["delta_cosine"] >= self.report["target"] or error <= most):
+        try:
+            ours, target = held[HALF_SUMS], self.report["target"]
+            error, cosine, of_fp8 = ours["relative_rms"], ours["delta_cosine"], held["fp8"]["relative_rms"]
+            if not all(map(is_finite, (error, cosine, of_fp8, target))):
+                raise TypeError
+        except (KeyError, TypeError):
+            raise CalibrationError(f"{name} doesn't say what {HALF_SUMS} costs: its report is damaged") from None
+        most = HALF_SUMS_COST * of_fp8
+        if not (cosine >= target or error <= most):
             raise ConfigError(
                 f"{name} doesn't allow {HALF_SUMS}: the held-out actions' error {error:.4f} is beyond {most:.4f} and "
                 "their cosine below the target; take 'fp8'"

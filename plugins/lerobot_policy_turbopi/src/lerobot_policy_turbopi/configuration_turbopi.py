@@ -43,7 +43,7 @@ class TurboPiConfig(PreTrainedConfig):
     server               in place of a checkpoint: ws://HOST:PORT, a `turbopi serve CHECKPOINT` that computes for this
                          robot. It decides about backend, precision and steps. Its key: the variable TURBOPI_API_KEY
     backend              a name from `turbopi doctor`; "auto" takes the fastest one available
-    precision            "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
+    precision            "bf16", "f32", or with a calibration "fp8", "int8", … (docs/quantization.md)
     quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json or
                          turbopi_int8.json in its folder
     num_inference_steps  denoising steps a chunk, of pi0_fast tokens of an answer at most; None: the checkpoint's

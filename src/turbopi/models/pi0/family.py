@@ -6,6 +6,7 @@ from turbopi.models.family import Family
 from turbopi.models.pi0.memory import MemoryModel
 from turbopi.models.pi0.reference import Pi0Model, parameter_dtype
 from turbopi.models.pi0.sites import linears
+from turbopi.quantization.plan import TIERS
 
 PI05 = Family(
     "pi05",
@@ -18,8 +19,9 @@ PI05 = Family(
     state_step="pi05_prepare_state_tokenizer_processor_step",
     prompt_tokens=200,
     linears=linears,
+    tiers=TIERS,
 )
-PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False, linears=None)
+PI05_VISUAL_MEMORY = replace(PI05, label="Pi0.5 with memory", reference=MemoryModel, planned=False, tiers=())
 PI05_STATE_MEMORY = replace(PI05_VISUAL_MEMORY, state_in_prefix=True)
 PI0 = Family(
     "pi0",
@@ -32,4 +34,5 @@ PI0 = Family(
     state_step=None,
     prompt_tokens=48,
     linears=linears,
+    tiers=TIERS,
 )

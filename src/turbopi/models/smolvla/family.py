@@ -32,4 +32,5 @@ SMOLVLA = Family(
     paligemma=False,
     counts=counts,
     linears=linears,
+    tiers=("fp8", "fp8-mlp", "int8"),
 )
