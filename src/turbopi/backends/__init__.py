@@ -50,6 +50,12 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+_CAPABILITIES: dict[Precision, str] = {  # that precisions need, where it isn't FP8's
+    WEIGHTS_ALONE: "8.0 or newer",
+    HALF_SUMS: "8.9 or 12.x",
+    "int8": "8.x, 9.0 or 12.x",
+    "nvfp4": "10.x, 11.0 or 12.x",
+}
 
 
 @dataclass(frozen=True)
@@ -339,9 +345,8 @@ def check(
         raise BackendUnavailable(why)
     reason, what = _unavailable(cls, device), "run"
     if precision in ROUNDED and reason is not None and device.type != "cuda":
-        which = {"int8": "8.x, 9.0 or 12.x", "nvfp4": "10.x, 11.0 or 12.x", HALF_SUMS: "8.9 or 12.x"}
-        newer = (which | {WEIGHTS_ALONE: "8.0 or newer"}).get(precision, "8.9 or newer")
-        reason = f"{precision} needs an NVIDIA GPU of compute capability {newer}"
+        which = _CAPABILITIES.get(precision, "8.9 or newer")
+        reason = f"{precision} needs an NVIDIA GPU of compute capability {which}"
         reason += _instead(device, precision, model, kept)
     elif precision in TIERS and (other_gpu := cls.unavailable_in(device, precision)) is not None:
         reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
@@ -350,10 +355,6 @@ def check(
         reason, what = unqualified(device, precision, given), f"run in {precision}"
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")
-
-
-def _runs(name: str, device: torch.device, precision: Precision, model: Network) -> bool:
-    return _is_for(precision, model) and refusal(name, device, precision, model) is None
 
 
 def _is_for(precision: Precision, model: Network) -> bool:
@@ -373,7 +374,7 @@ def _instead(device: torch.device, precision: Precision, model: Network, kept: b
     if kept:
         return ""
     runs: list[tuple[str, Precision]] = [("cuda_graph", WEIGHTS_ALONE), ("fused", "fp8"), ("fused", "int8")]
-    others = [one for name, one in runs if one != precision and _runs(name, device, one, model)]
+    others = [one for name, one in runs if one != precision and refusal(name, device, one, model) is None]
     advice = "; take precision " + " or ".join(map(repr, ("bf16", *others)))
     if device.type != "cuda" and precision in TIERS and _is_for(precision, model):
         format = format_of(precision)

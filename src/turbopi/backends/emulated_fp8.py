@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.engine.emulate import Round, input_rounding, put_into_norm, put_product, round_weight
-from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.portable.quantize import by_plan
 from turbopi.models import linears
 from turbopi.models.pi0.conditioning import Form
 from turbopi.models.pi0.sites import norm_of
-from turbopi.quantization.fp8 import Matrix, to_e4m3
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites
 
@@ -47,7 +47,8 @@ class EmulatedFp8Backend(PyTorchBackend):
             directions = self._plan.directions.get(str(site))
             for linear in linears(self.model, site):
                 if self._plan.has_half_sums(str(site)):
-                    matrix = quantize(linear.weight.data, scale, directions).for_half_sums()
+                    matrix = by_plan(self._plan, str(site), linear.weight.data)
+                    assert isinstance(matrix, ScaledMatrix), "float16 sums are FP8's"
                     put_product(linear, partial(to_e4m3, inverse=1 / scale), partial(_given, matrix))
                     continue
                 linear.weight.data = round_weight(linear.weight.data, directions, format)

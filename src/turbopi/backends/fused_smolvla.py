@@ -9,7 +9,6 @@ the expert's weights in INT8 or, beside FP8, in bfloat16. All other ways to deno
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -28,7 +27,6 @@ from turbopi.engine.smolvla_batch import ExpertByOps
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
-from turbopi.kernels.portable.quantize import by_plan
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.conditioning import Conditioning
 from turbopi.models.pi0.kv_cache import KVCache
@@ -91,9 +89,8 @@ class FusedSmolVLABackend(CapturedBackend):
         )
         self._tiles, self._without = tiles_of(self.device), excluded(self.device, self.precision, self.config)
         ops = self._make_ops()
-        make = partial(by_plan, self._plan)
-        self._tower = smolvla.Vision.pack(self.model, ops, self._dtype, make)
-        self._prefix = smolvla.Prefix.pack(self.model, ops, self._dtype, make)
+        self._tower = smolvla.Vision.pack(self.model, ops, self._dtype, self._plan)
+        self._prefix = smolvla.Prefix.pack(self.model, ops, self._dtype, self._plan)
         self._prefix_of = self._prefix_stage
         self._expert = smolvla.Expert.pack(self.model, self._plan)
         self._ops, self._origin = ops, ops.origin

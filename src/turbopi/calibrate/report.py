@@ -37,7 +37,17 @@ class WorstCall(Struct, frozen=True):
     relative_rms: float
 
 
-class HeldOut(Struct, frozen=True, omit_defaults=True):
+class _HeldOut(Struct, frozen=True):
+    """What all formats have."""
+
+    def errors(self) -> dict[str, ActionsError]:
+        """All but the worst call's, by the name that the file has for each."""
+        names = zip(self.__struct_fields__, self.__struct_encode_fields__, strict=True)
+        found = {name: getattr(self, own) for own, name in names if own != "worst"}
+        return {name: error for name, error in found.items() if error is not None}
+
+
+class HeldOut(_HeldOut, frozen=True, omit_defaults=True):
     """Of FP8, on observations that chose nothing. The sites that are kept run in float32 here."""
 
     fp8: ActionsError
@@ -50,12 +60,8 @@ class HeldOut(Struct, frozen=True, omit_defaults=True):
     worst: WorstCall
     f16sums: ActionsError | None = field(name="fp8-f16sums", default=None)  # not in older files
 
-    def errors(self) -> dict[str, ActionsError]:
-        """All but the worst call's, by the name that the file has for each."""
-        return _errors(self)
 
-
-class Int8HeldOut(Struct, frozen=True):
+class Int8HeldOut(_HeldOut, frozen=True):
     """The same of INT8."""
 
     int8: ActionsError
@@ -66,11 +72,8 @@ class Int8HeldOut(Struct, frozen=True):
     int8_against_bf16: ActionsError = field(name="int8 against bf16")
     worst: WorstCall
 
-    def errors(self) -> dict[str, ActionsError]:
-        return _errors(self)
 
-
-class Nvfp4HeldOut(Struct, frozen=True):
+class Nvfp4HeldOut(_HeldOut, frozen=True):
     """The same of NVFP4, which the expert hasn't."""
 
     nvfp4: ActionsError
@@ -79,15 +82,6 @@ class Nvfp4HeldOut(Struct, frozen=True):
     bf16: ActionsError
     nvfp4_against_bf16: ActionsError = field(name="nvfp4 against bf16")
     worst: WorstCall
-
-    def errors(self) -> dict[str, ActionsError]:
-        return _errors(self)
-
-
-def _errors(held_out: Struct) -> dict[str, ActionsError]:
-    names = zip(held_out.__struct_fields__, held_out.__struct_encode_fields__, strict=True)
-    found = {name: getattr(held_out, own) for own, name in names if own != "worst"}
-    return {name: error for name, error in found.items() if error is not None}
 
 
 class CalibrationReport(Struct, frozen=True):

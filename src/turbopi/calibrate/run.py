@@ -229,7 +229,7 @@ def calibrate_model(
         )
     if reached < settings.target:
         warnings.append(f"the held-out actions' cosine is {reached:.5f}, below the target {settings.target}")
-    elif (half := on_held_out.get(HALF_SUMS, on_held_out[format.name])["delta_cosine"]) < settings.target:
+    elif HALF_SUMS in on_held_out and (half := on_held_out[HALF_SUMS]["delta_cosine"]) < settings.target:
         warnings.append(f"in {HALF_SUMS} their cosine is {half:.5f}, below the target {settings.target}")
     report = {
         "steps": steps,

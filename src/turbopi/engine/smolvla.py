@@ -19,11 +19,12 @@ from torch import Tensor, nn
 
 from turbopi.config import GemmaConfig
 from turbopi.engine.forward import HEAD_LAYERS, Rope, VisionByOps
-from turbopi.engine.weight_placement import MakeMatrix, WeightPlacement, in_whole_lines
+from turbopi.engine.weight_placement import WeightPlacement, in_whole_lines
 from turbopi.kernels.interface import Affine, GemmaLayer, Ops, VisionLayer, VisionStream
 from turbopi.kernels.portable.denoise.kernel import Mixing, PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import Form, PackedExpert, refusal_of_sizes
 from turbopi.kernels.portable.grouped import grouped_attention, rope_grouped, swiglu
+from turbopi.kernels.portable.quantize import by_plan
 from turbopi.models.observation import Observation
 from turbopi.models.pi0.denoise import time_grid
 from turbopi.models.pi0.layers import rope_tables
@@ -40,10 +41,6 @@ def refusal(config: SmolVLAConfig) -> str | None:
     if config.text.head_dim < 16 or config.vision.head_dim < 16:
         return "heads are narrower than a tensor core's 16 columns"
     return refusal_of_sizes(ExpertSizes.of(config).expert)
-
-
-def _as_it_is(place: str, matrix: Tensor) -> Matrix:
-    return matrix
 
 
 class Placement(WeightPlacement):
@@ -78,11 +75,11 @@ class Vision:
     projector: Tensor
 
     @classmethod
-    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, make: MakeMatrix = _as_it_is) -> "Vision":
-        """make: what becomes of the layers' matrices; the model loses those that are rounded."""
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, plan: PrecisionPlan | None = None) -> "Vision":
+        """plan: in what the layers' matrices are, None: all in `dtype`; the model loses those that are rounded."""
         vision, side = model.vision, model.config.image_size // model.config.vision.patch_size
         weight, bias = _affine(vision.patch_embedding, dtype)
-        layers = [_vision_layer(layer, dtype, make, i) for i, layer in enumerate(vision.layers)]  # type: ignore[arg-type]
+        layers = [_vision_layer(layer, dtype, plan, i) for i, layer in enumerate(vision.layers)]  # type: ignore[arg-type]
         norm = _affine(vision.post_layernorm, dtype)
         positions = vision.positions(side, side).to(dtype)
         return cls(model, ops, layers, (weight.flatten(1), bias), positions, norm, model.projector.weight.to(dtype))
@@ -133,9 +130,9 @@ def _merged(modules: Sequence[nn.Linear], dtype: torch.dtype) -> Tensor:
     return whole
 
 
-def _made(make: MakeMatrix, place: str, *modules: nn.Linear, dtype: torch.dtype) -> Matrix:
-    """What `make` makes of their weights, `_merged`. Of rounded ones the modules keep nothing: nobody reads them."""
-    made = make(place, _merged(modules, dtype))
+def _made(plan: PrecisionPlan | None, place: str, *modules: nn.Linear, dtype: torch.dtype) -> Matrix:
+    """Their weights, `_merged`, as the plan has them. Of rounded ones the modules keep nothing: nobody reads them."""
+    made = by_plan(plan, place, _merged(modules, dtype))
     assert not isinstance(made, Nvfp4Matrix), "a backend's precisions say what it has"
     if isinstance(made, ScaledMatrix):
         for one in modules:
@@ -143,12 +140,12 @@ def _made(make: MakeMatrix, place: str, *modules: nn.Linear, dtype: torch.dtype)
     return made
 
 
-def _vision_layer(layer: EncoderLayer, dtype: torch.dtype, make: MakeMatrix, number: int) -> VisionLayer:
+def _vision_layer(layer: EncoderLayer, dtype: torch.dtype, plan: PrecisionPlan | None, number: int) -> VisionLayer:
     attention, mlp = layer.self_attn, layer.mlp
     projections = (attention.q_proj, attention.k_proj, attention.v_proj)
 
     def matrix(kind: str, *modules: nn.Linear) -> Matrix:
-        return _made(make, f"vision.{number}.{kind}", *modules, dtype=dtype)
+        return _made(plan, f"vision.{number}.{kind}", *modules, dtype=dtype)
 
     fc1, fc2 = in_whole_lines(matrix("fc1", mlp.fc1), matrix("fc2", mlp.fc2))
     return VisionLayer(
@@ -182,8 +179,8 @@ class Prefix:
     _numbered: dict[tuple[int, int], tuple[Tensor, Rope]] = field(default_factory=dict)
 
     @classmethod
-    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, make: MakeMatrix = _as_it_is) -> "Prefix":
-        """make: as of `Vision`"""
+    def pack(cls, model: SmolVLAModel, ops: Ops, dtype: torch.dtype, plan: PrecisionPlan | None = None) -> "Prefix":
+        """plan: as of `Vision`"""
         config, embed, every = model.config, model.vlm.embed_tokens, form(model.config).self_every
 
         def matrices(its: slice) -> Tensor:
@@ -198,7 +195,7 @@ class Prefix:
             for ids in (config.image_start, config.image_end)
         )
         scale = float(torch.tensor(config.text.width**0.5, dtype=dtype))  # rounded, as LeRobot's is
-        layers = [joined(layer, dtype, make, f"prefix.{i}") for i, layer in enumerate(model.vlm.layers)]
+        layers = [joined(layer, dtype, plan, f"prefix.{i}") for i, layer in enumerate(model.vlm.layers)]
         return cls(model, ops, layers, every, across, (start, end), scale)
 
     def places(self, cameras: int) -> int:
@@ -372,7 +369,7 @@ class Expert:
         )
 
 
-def joined(layer: Layer, dtype: torch.dtype, make: MakeMatrix = _as_it_is, place: str = "") -> GemmaLayer[Any]:
+def joined(layer: Layer, dtype: torch.dtype, plan: PrecisionPlan | None = None, place: str = "") -> GemmaLayer[Any]:
     """A layer across has keys and values of its own, made of the prefix's: their rows here are zeros, which are never
     read.
     """
@@ -382,7 +379,7 @@ def joined(layer: Layer, dtype: torch.dtype, make: MakeMatrix = _as_it_is, place
     none = q.new_zeros(2 * len(of.k_proj.weight), q.shape[1]) if across else q[:0]
 
     def matrix(kind: str, *modules: nn.Linear) -> Matrix:
-        return _made(make, f"{place}.{kind}", *modules, dtype=dtype)
+        return _made(plan, f"{place}.{kind}", *modules, dtype=dtype)
 
     return GemmaLayer(
         torch.cat((q, none)) if across else matrix("qkv", of.q_proj, of.k_proj, of.v_proj),

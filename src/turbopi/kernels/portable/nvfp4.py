@@ -1,6 +1,6 @@
 """Products in NVFP4 for GPUs whose tensor cores multiply it: compute capability 10.x, 11.0 and 12.x.
 
-An activation is rounded by a kernel of its own in front of each product: two launches. Twin: `Nvfp4Matrix.product`.
+An activation is rounded by a kernel of its own before each product: two launches. Reference: `Nvfp4Matrix.product`.
 Triton makes tcgen05.mma or mma.sync of the same source, both of kind::mxf4nvf4 with a scale for 16 numbers, and brings
 the scales, which lie row by row, into their order.
 
@@ -65,7 +65,7 @@ def _round_kernel(
 
 def round_activation(x: Tensor, scale: float) -> tuple[Tensor, Tensor]:
     """x [tokens, in] -> (codes uint8[tokens, whole(in) / 2], blocks e4m3[tokens, whole(in) / 16]) with this scale of
-    the tensor. `in` is a multiple of 16. Twins: `quantization.nvfp4.block_scales`, `round_blocks`, `pack`.
+    the tensor. `in` is a multiple of 16. References: `quantization.nvfp4.block_scales`, `round_blocks`, `pack`.
     """
     rows, inner = x.shape
     assert x.is_contiguous() and inner % BLOCK == 0, "rows are read as they lie in memory, block by block"
