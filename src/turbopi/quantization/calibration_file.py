@@ -25,7 +25,7 @@ from turbopi.support.reading import is_finite, is_integer, one_line, read_json, 
 # version 1 has no directions; 2 has no scales for the expert's activations; 4 says `numbers`. FP8's files are written
 # as version 3, which older Turbo-Pis read, too.
 FORMAT, VERSION, FP8_VERSION = "turbopi-quantization", 4, 3
-HALF_SUMS_COST = 1.5  # times FP8's error: 1.16 was seen by chance, as roundings near an edge fall either way
+HALF_SUMS_COST = 1.5  # times FP8's error: by chance it may be more or less, as roundings near an edge fall either way
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
 
 
